@@ -51,6 +51,7 @@ class CandidateFit:
     heldout_chi: the same, each trial's over what noise and contacts make of its prediction, RMS of the trials: one that
         tumbled chaotically does not decide whether a model predicts better. NaN where that is not known.
     heldout_trials: what ``heldout_chi`` is the RMS of, in the order of bodies and trials; () where that is not known.
+    heldout_elsewhere: of each of these, whether the body comes to lie on another face than predicted.
     bending: nats by which a missing force, beside a slow error of the recording, explains what the model leaves of
         whole trials; of single tracked points, measured for the nominal model and the re-fitted one. Else 0.
     misfit: RMS residual over what noise and numerical error would leave; 1 is explained, far above 1 means that
@@ -66,6 +67,7 @@ class CandidateFit:
     misfit: float
     heldout_chi: float = math.nan
     heldout_trials: tuple[float, ...] = ()
+    heldout_elsewhere: tuple[bool, ...] = ()
     bending: float = 0.0
 
 

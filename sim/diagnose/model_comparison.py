@@ -36,7 +36,8 @@ from .report.wording import effect_label
 class ComparisonSettings:
     """Constants of the decision.
 
-    temperature: T above, at least 1. fee: d above, nats.
+    temperature: T above, at least 1. fee: d above, nats; where held-out trials exclude ``none``, it falls like
+        second_fee with the error that the likeliest effect leaves them.
     predicts: fraction of the nominal model's held-out error that an effect must stay below.
     worsens: factor on the nominal misfit, if that is above 1, from which an effect has no gain. It contains the nominal
         model: what leaves so much more, as where its contacts are surer and wrong, explains nothing.
@@ -52,9 +53,10 @@ class ComparisonSettings:
         divided by the same factor, and ``unknown`` gets the rest.
     second_fee: nats that a second effect pays, beside its prior; with unseen_fee where the pair predicts held-out
         trials no better than its better single effect.
-    clearly: fraction of the better single effect's held-out error at which a pair pays no second_fee, which falls from
-        ``predicts`` on: states between contacts absorb what a second effect explains there, so that the evidence
-        hardly shows it; held-out trials, predicted through their contacts, do.
+    clearly: fraction of the better single effect's held-out error at which a pair pays no second_fee, and of the
+        nominal model's at which effects pay no fee where ``none`` is excluded; both fall from ``predicts`` on: states
+        between contacts absorb what an effect explains there, so that the evidence hardly shows it; held-out trials,
+        predicted through their contacts, do.
     predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
     many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
     chance: probability, if noise and grain are all there is, of held-out trials so far off that they exclude ``none``.
@@ -101,6 +103,9 @@ CONTAINING = ("wind",)
 
 MOST_ALTERNATIVES = 4
 
+BETTER = "an effect explains the trials far better"
+"""Why it is not ``none`` where nothing speaks against it."""
+
 TWIN_SHARE = 0.003
 """A twin is named from this fraction of the verdict's probability on."""
 
@@ -123,11 +128,12 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
     worth = (c for c in fits.candidates if _worth_it(c, fits.candidates))
     candidates = [nominal_or_refitted(fits), *worth]
     grain = math.hypot(fits.floor_rms_m, fits.grain_rms_m)
-    weights = _weights(candidates, weighing, grain)
+    against = _against_none(fits, weighing)
+    weights = _weights(candidates, weighing, grain, far=against.left == 0.0)
     adequate = [
         _adequacy(c.misfit, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates
     ]
-    adequate[0] *= 0.0 if _far_off(fits, weighing) else _straight(fits, weighing)
+    adequate[0] *= against.left
     shares = [w * a for w, a in zip(weights, adequate, strict=True)]
     predicted = [_predicted(c, fits, weighing) for c in candidates]
     if max(predicted) > 0:
@@ -145,12 +151,12 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
             best[name] = (probability, fit)
     probabilities[UNKNOWN] = max(0.0, 1.0 - sum(probabilities.values()))
     total = sum(probabilities.values())
-    barred = {NONE} if _objection(fits, weighing) else set()
+    barred = {NONE} if against.said else set()
     probabilities = _never_sure({name: p / total for name, p in probabilities.items()}, weighing.lapse, barred)
     found = {name: fit for name, (_, fit) in best.items()}
     verdict = _verdict(probabilities, found, weighing)
     reasons = {
-        name: _reason(fit, found, fits, weighing)
+        name: _reason(fit, found, fits, weighing) if fit.effects else against.said or BETTER
         for name, fit in found.items()
         if name not in (verdict.effect, *verdict.effects, *verdict.alternatives)
     }
@@ -179,12 +185,24 @@ def closed_fraction(before: float, after: float, floor: float) -> float:
     return min(max((before - after) / (before - floor), -1.0), 1.0)
 
 
-def _objection(fits: FittedModels, weighing: ComparisonSettings) -> str:
-    """Return what the nominal model leaves that speaks against ``none``, in a few words; "" if nothing does."""
+@dataclass(frozen=True, kw_only=True)
+class _AgainstNone:
+    """What the models behind ``none`` leave that speaks against it.
+
+    said: in a few words; "" if nothing does. left: factor on what ``none`` may claim.
+    """
+
+    said: str
+    left: float
+
+
+def _against_none(fits: FittedModels, weighing: ComparisonSettings) -> _AgainstNone:
     far = _far_off(fits, weighing)
-    if far or _straight(fits, weighing) >= 0.5:
-        return far
-    return "what it leaves of whole trials bends as under a missing force"
+    if far:
+        return _AgainstNone(said=far, left=0.0)
+    straight = _straight(fits, weighing)
+    bends = "" if straight >= 0.5 else "what it leaves of whole trials bends as under a missing force"
+    return _AgainstNone(said=bends, left=straight)
 
 
 def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:
@@ -192,21 +210,25 @@ def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:
     models = fits.nominal, nominal_or_refitted(fits)
     if min(m.heldout_rms_m for m in models) > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m):
         return f"its error is more than {weighing.many:g} times noise and the simulator's own uncertainty"
-    if min(_surprise(m.heldout_trials) for m in models) > _expected_surprise(models[0].heldout_trials, weighing):
+    if min(map(_surprise, models)) > _expected_surprise(models[0].heldout_trials, weighing):
         chi = min(m.heldout_chi for m in models)
         return f"held-out trials are {chi:.1f} times as far off as noise and the simulator's own uncertainty make each"
     return ""
 
 
 OUTLYING = 3.0
-"""A trial counts at most as this many times the median one: one that came to lie on another face does not decide."""
+"""A trial in which the body comes to lie on another face counts at most as this many times the median one: its distance
+says that it fell the other way, not by how much the model is wrong."""
 
 
-def _surprise(trials: Sequence[float]) -> float:
-    """Return the sum of squares of the held-out ``trials``, each over what noise and grain make of it."""
-    known = np.array([t for t in trials if math.isfinite(t)])
-    most = OUTLYING * float(np.median(known)) if len(known) > 2 else math.inf
-    return float(np.sum(np.minimum(known, most) ** 2))
+def _surprise(fit: CandidateFit) -> float:
+    """Return the sum of squares of held-out trials, each over what noise and grain make of it."""
+    trials = np.array(fit.heldout_trials)
+    known = np.isfinite(trials)
+    away = np.array(fit.heldout_elsewhere, dtype=bool) & known if fit.heldout_elsewhere else np.zeros_like(known)
+    if known.sum() > 2:
+        trials[away] = np.minimum(trials[away], OUTLYING * float(np.median(trials[known])))
+    return float(np.sum(trials[known] ** 2))
 
 
 def _expected_surprise(trials: Sequence[float], weighing: ComparisonSettings) -> float:
@@ -231,13 +253,8 @@ def _predicted(fit: CandidateFit, fits: FittedModels, weighing: ComparisonSettin
 def _reason(
     fit: CandidateFit, best: Mapping[str, CandidateFit], fits: FittedModels, weighing: ComparisonSettings
 ) -> str:
-    """Return why ``fit`` is not the verdict, in a few words."""
+    """Return why the effects of ``fit`` are not the verdict, in a few words."""
     nominal = nominal_or_refitted(fits)
-    if not fit.effects:
-        objection = _objection(fits, weighing)
-        if objection:
-            return objection
-        return "an effect explains the trials far better"
     if not math.isfinite(fit.log_evidence) or not math.isfinite(fit.heldout_rms_m):
         return "its simulation failed"
     if abs(fit.heldout_rms_m - nominal.heldout_rms_m) <= 1e-6 * nominal.heldout_rms_m:
@@ -287,11 +304,19 @@ def _second_fee(fit: CandidateFit, candidates: Sequence[CandidateFit], weighing:
     left = max(_left(fit, c) for c in singles)
     if not left < weighing.predicts:
         return weighing.second_fee + weighing.unseen_fee
+    return weighing.second_fee * _unsure(left, weighing)
+
+
+def _unsure(left: float, weighing: ComparisonSettings) -> float:
+    """Return the part of a fee that is due where held-out trials are left with ``left`` of their error: 1 to 0."""
     share = math.log(max(left, 1e-9) / weighing.clearly) / math.log(weighing.predicts / weighing.clearly)
-    return weighing.second_fee * max(share, 0.0)
+    return min(max(share, 0.0), 1.0)
 
 
-def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings, grain: float) -> list[float]:
+def _weights(
+    candidates: Sequence[CandidateFit], weighing: ComparisonSettings, grain: float, *, far: bool
+) -> list[float]:
+    """Return the weights of ``candidates``, the nominal model first. far: held-out trials exclude that one."""
     nominal = candidates[0]
     logs = []
     for fit in candidates:
@@ -303,6 +328,11 @@ def _weights(candidates: Sequence[CandidateFit], weighing: ComparisonSettings, g
         prior *= weighing.containing ** sum(name in CONTAINING for name in fit.effects)
         gain = _gain(fit, nominal, weighing, grain) - _second_fee(fit, candidates, weighing)
         logs.append(math.log(prior) + gain / weighing.temperature)
+    likeliest = max(range(1, len(logs)), key=lambda i: logs[i], default=0)
+    if likeliest:
+        # What held-out trials ask for, and get, is no chance gain of a search that has not seen them.
+        due = _unsure(_left(candidates[likeliest], nominal), weighing) if far else 1.0
+        logs[1:] = [log - due * weighing.fee / weighing.temperature for log in logs[1:]]
     highest = max(logs)
     raw = np.exp(np.array(logs) - highest)
     return [float(w) for w in raw / raw.sum()]
@@ -339,7 +369,7 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
     if _left(fit, nominal) >= weighing.predicts:
         # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.
         gain = min(gain, max(gain - weighing.unseen_fee, 0.0) if nominal.heldout_rms_m < grain else 0.0)
-    return gain - weighing.fee
+    return gain
 
 
 def _shown(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings) -> float:

@@ -22,6 +22,7 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=0.002, value=1.0, spread=0.1):
         "misfit": misfit,
         "heldout_log_score": [0.0, None],
         "heldout_trials": [0.4, 2.2],
+        "heldout_elsewhere": [False, True],
         "bending": 1.5,
         "parameters": {e: {names[e]: interval} for e in effects},
     }
@@ -64,6 +65,7 @@ def folder(tmp_path):
 
 def test_records_are_judged_as_a_diagnosis_judges(folder):
     records = load_records(folder)
+    assert records[1].candidates[0].heldout_elsewhere == (False, True)
     assert records[1].candidates[0].heldout_trials == (0.4, 2.2) and records[1].nominal.bending == 1.5
     cases = [judge(r, ComparisonSettings()) for r in records]
     assert [c.verdict for c in cases] == ["none", "air_drag", "air_drag", "air_drag", "unknown"]

@@ -43,7 +43,7 @@ class Found:
     grain_rms_m: float = 0.0
 
 
-def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), bending=0.0):
+def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), elsewhere=(), bending=0.0):
     parameters = {name: {"x": Estimate(value=1.0, unit="1", low=0.5, high=1.5)} for name in effects}
     return CandidateFit(
         effects=effects,
@@ -54,6 +54,7 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), b
         misfit=misfit,
         heldout_chi=float(np.sqrt(np.mean(np.square(trials)))) if trials else chi,
         heldout_trials=tuple(trials),
+        heldout_elsewhere=tuple(elsewhere),
         bending=bending,
     )
 
@@ -244,7 +245,12 @@ def test_none_is_never_said_where_trials_are_many_times_off_each():
     assert found.verdict.effect == UNKNOWN and found.probabilities[NONE] == 0.0
     assert "5.1 times" in found.reasons[NONE]
     # One trial that comes to lie on another face is no gap, nor is what noise makes of a single one.
-    assert nothing_found(trials=(0.5, 9.0, 0.6, 0.4, 0.8)).verdict.effect == NONE
+    fallen = (False, True, False, False, False)
+    assert nothing_found(trials=(0.5, 9.0, 0.6, 0.4, 0.8), elsewhere=fallen).verdict.effect == NONE
+    # All of them are one, and so is one that lies as predicted, beside others in which the cause hardly acts.
+    assert nothing_found(trials=(5.0, 9.0, 6.0, 4.0, 8.0), elsewhere=(True,) * 5).verdict.effect == UNKNOWN
+    restitution = nothing_found(trials=(0.5, 0.5, 8.3, 0.7), elsewhere=(False,) * 4)
+    assert restitution.verdict.effect == UNKNOWN and restitution.probabilities[NONE] == 0.0
     assert nothing_found(trials=(2.0,)).verdict.effect == NONE and nothing_found().verdict.effect == NONE
 
 
@@ -255,6 +261,26 @@ def test_noise_alone_hardly_ever_excludes_none(count):
     # One in a thousand is wanted; 4 of 400 or more have a chance of one in a thousand then.
     assert false < 4
     assert all(nothing_found(trials=tuple(map(float, 4 + trials))).verdict.effect == UNKNOWN for trials in drawn[:20])
+
+
+@pytest.mark.parametrize(
+    ("chi", "nats", "found"), [(0.95, 15.8, "friction"), (2.25, 15.8, UNKNOWN), (0.95, 2.0, UNKNOWN)]
+)
+def test_what_held_out_trials_ask_for_pays_no_fee_for_the_search(chi, nats, found):
+    """A friction of 0.305 for 0.334 gains 16 nats in all, as states between contacts absorb what it does; held-out
+    trials exclude none, and it predicts them down to noise and grain. It was unknown, 0.53."""
+    nominal = fit(misfit=0.78, rms=0.0089, trials=(2.3, 1.0, 1.1, 3.1, 3.1))
+    friction = fit("friction", evidence=nats, misfit=0.70, rms=0.0031, chi=chi)
+    fits = Found(nominal=nominal, refitted=nominal, candidates=(friction,), floor_rms_m=0.0019, grain_rms_m=0.0034)
+    result = compare_models(fits, ComparisonSettings())
+    assert result.verdict.effect == found and result.probabilities[NONE] == 0.0
+    if found == "friction":
+        assert 0.7 < result.verdict.probability < 0.9
+        # Trials that do not exclude none leave it to the evidence, which is little.
+        quiet = dataclasses.replace(nominal, heldout_chi=1.0, heldout_trials=(1.0,) * 5)
+        calm = dataclasses.replace(friction, heldout_chi=0.4)
+        fits = dataclasses.replace(fits, nominal=quiet, refitted=quiet, candidates=(calm,))
+        assert compare_models(fits, ComparisonSettings()).verdict.effect == NONE
 
 
 def test_none_yields_to_unknown_as_what_is_left_bends():

@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.rigid import fit_rigid
 from physgen.sim.diagnose.rigid.observed_poses import (
+    another_side_up,
     as_matrix,
+    from_rotvec,
+    multiply,
     observe_body,
     perturbed,
     state_difference,
@@ -90,6 +93,40 @@ def test_a_body_that_slides_and_turns_on_a_face_is_told_from_others(rate, rise, 
     scene = scene_of(box((0.06, 0.06, 0.06)), trials=(trial,))
     seen = [observe_body(scene.capture, trial, 0, scene.body.center)]
     assert turns_on_a_face(seen, np.array([0.0, 0.0, 1.0]), scene.body.bound) is found
+
+
+@pytest.mark.parametrize(
+    ("spin", "turn", "found"),
+    [(0.0, 0.3, False), (2.0, 0.3, False), (3.0, 0.0, False), (1.0, 0.9, True), (0.0, 1.6, True), (0.5, 3.1, True)],
+)
+def test_a_body_lies_on_another_face_where_another_side_is_up(spin, turn, found):
+    """Turned about the upright it lies on the same one, tipped by more than half a right angle it does not."""
+    up, lies = np.array([0.0, 0.6, 0.8]), from_rotvec(np.array([0.4, -1.1, 0.7]))
+    tipped = multiply(from_rotvec(turn * np.array([1.0, 0.0, 0.0])), lies)
+    assert another_side_up(lies, multiply(from_rotvec(spin * up), tipped), up) is found
+
+
+def test_a_cube_that_tumbles_as_predicted_lies_nowhere_else():
+    """It turns by three right angles in all: the sides that are up are compared at the same instant."""
+    rng = np.random.default_rng(1)
+    times, trials, rest = np.arange(0, 0.4, 0.02), [], 0.03 * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [1, 1, -1]])
+    for n in range(2):
+        turns = as_matrix(from_rotvec(np.outer(times, [12.0, 2.0 * n, 1.0])))
+        path = np.outer(times, [1.0, 0.5 * n, 2.0]) - np.outer(times**2, [0, 0, 4.905]) + [0, 0, 1.0]
+        points = path[:, None] + np.einsum("tij,kj->tki", turns, rest)
+        trials.append(
+            Trial(
+                name=f"take{n}",
+                role="fit",
+                times=times,
+                points=points + 2e-4 * rng.normal(size=points.shape),
+                pixels=None,
+                object_index=np.zeros(len(rest), dtype=np.int64),
+                rest_points=rest,
+            )
+        )
+    found = fit_rigid(scene_of(box((0.06, 0.06, 0.06)), trials, sigma=2e-4).capture, ["buoyancy"]).nominal
+    assert found.heldout_elsewhere == (False, False) and max(found.heldout_trials) < 3.0
 
 
 def test_an_icosphere_is_a_sphere_and_a_cube_is_not():
@@ -391,7 +428,7 @@ def test_a_hollow_ball_is_told_by_the_speed_at_which_it_begins_to_roll():
     assert found.value == pytest.approx(5 / 3, rel=0.05)
     # The held-out error counts by trial, in units of what noise and contacts make of it.
     assert best.heldout_chi < 0.3 * fits.nominal.heldout_chi
-    assert len(best.heldout_trials) == 3
+    assert len(best.heldout_trials) == 3 and best.heldout_elsewhere == (False,) * 3
     assert best.heldout_chi == pytest.approx(np.sqrt(np.mean(np.square(best.heldout_trials))), rel=1e-9)
 
 

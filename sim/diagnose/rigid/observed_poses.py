@@ -23,6 +23,9 @@ LEVEL_SHARE, LEVEL_ANGLE, LEAST_TURN = 0.1, 0.1, 0.3
 """A body slides on a face where its height changes by at most this share of its size, and its upright by this angle in
 rad; from this turn in rad on it tells where that face carries."""
 
+OTHER_SIDE = float(np.cos(np.pi / 4))
+"""Cosine between the directions that point up, in body axes, below which another side is up: half a right angle."""
+
 
 def multiply(p: Array, q: Array) -> Array:
     """Return the rotation by ``q``, then by ``p``."""
@@ -388,6 +391,12 @@ def frame_pose(
     good, way, shift = cv2.solvePnP(places, found, lens, None, way, shift, True, cv2.SOLVEPNP_ITERATIVE)
     turn = matrix[:3, :3] @ cv2.Rodrigues(way)[0]
     return matrix[:3, :3] @ shift[:, 0] + matrix[:3, 3], turn
+
+
+def another_side_up(one: Array, other: Array, up: Array) -> bool:
+    """Return whether a body with the orientations ``one`` and ``other``, quaternions, has two different sides up. up:
+    (3,), the ground's normal."""
+    return float((up @ as_matrix(one)) @ (up @ as_matrix(other))) < OTHER_SIDE
 
 
 def turns_on_a_face(seen: Sequence[ObservedBody], normal: Array, bound: float) -> bool:

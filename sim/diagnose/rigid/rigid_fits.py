@@ -275,10 +275,15 @@ def _level_twins(made: dict[tuple[str, ...], CandidateFit]) -> None:
         best = max(clock.log_evidence, weight.log_evidence)
         error = min(clock.heldout_rms_m, weight.heldout_rms_m)
         chi = min(clock.heldout_chi, weight.heldout_chi)
-        trials = min(clock, weight, key=lambda fit: fit.heldout_chi).heldout_trials
+        better = min(clock, weight, key=lambda fit: fit.heldout_chi)
         for twin in (clock, weight):
             made[twin.effects] = dataclasses.replace(
-                twin, log_evidence=best, heldout_rms_m=error, heldout_chi=chi, heldout_trials=trials
+                twin,
+                log_evidence=best,
+                heldout_rms_m=error,
+                heldout_chi=chi,
+                heldout_trials=better.heldout_trials,
+                heldout_elsewhere=better.heldout_elsewhere,
             )
 
 
@@ -319,6 +324,7 @@ def _candidate(
         heldout_rms_m=float(np.sqrt(np.mean([h.rms_m**2 for h in held]))),
         heldout_chi=float(np.sqrt(np.mean([h.chi**2 for h in held]))),
         heldout_trials=tuple(chi for h in held for chi in h.trials),
+        heldout_elsewhere=tuple(away for h in held for away in h.elsewhere),
         misfit=math.sqrt(square),
     )
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import Fit, solve
-from .observed_poses import ObservedBody, as_matrix, fit_rotation, perturbed
+from .observed_poses import ObservedBody, another_side_up, as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
 from .shooting_problem import Model, Problem, SegmentedTrial
@@ -239,13 +239,15 @@ def prediction_spread(fit: Fit) -> Array:
 class HeldOutScore:
     """Held-out scores. log_score: (fit trials,) nats. rms_m: RMS error predicted from the first frames.
 
-    trials: each one's error over ``prediction_spread``; () without it. chi: their RMS; NaN without them.
+    trials: each one's error over ``prediction_spread``; () without it. chi: their RMS; NaN without them. elsewhere: of
+    each, whether the body comes to lie on another face than it is predicted to.
     """
 
     log_score: Array
     rms_m: float
     chi: float = math.nan
     trials: tuple[float, ...] = ()
+    elsewhere: tuple[bool, ...] = ()
 
 
 def leave_one_out(fit: Fit) -> Array:
@@ -304,6 +306,7 @@ def score_held_out(fit: Fit, spread: Array | None = None) -> HeldOutScore:
     starts = first_states(fit, numbers)
     squares: list[Array] = []
     chis: list[float] = []
+    elsewhere: list[bool] = []
     for i, trial in enumerate(problem.trials):
         if trial.observations.trial.role != "fit" or len(trial.observations.times) < 5:
             continue
@@ -319,9 +322,21 @@ def score_held_out(fit: Fit, spread: Array | None = None) -> HeldOutScore:
         squares.append(np.sum(off**2, axis=-1).ravel())
         if spread is not None and np.isfinite(spread[i]) and np.isfinite(squares[-1]).any():
             chis.append(math.sqrt(float(mean_known(squares[-1]))) / float(spread[i]))
+            elsewhere.append(_lies_elsewhere(fit, i, begin, record))
     rms = float(np.sqrt(mean_known(np.concatenate(squares)))) if squares else float("nan")
     chi = float(np.sqrt(np.mean(np.square(chis)))) if chis else math.nan
-    return HeldOutScore(log_score=np.array(scores), rms_m=rms, chi=chi, trials=tuple(chis))
+    return HeldOutScore(log_score=np.array(scores), rms_m=rms, chi=chi, trials=tuple(chis), elsewhere=tuple(elsewhere))
+
+
+def _lies_elsewhere(fit: Fit, index: int, begin: int, record: Array) -> bool:
+    """Return whether the body of trial ``index``, last seen, has another side up than in the prediction ``record`` from
+    the frame ``begin`` on. Never of a sphere, which has no sides."""
+    scene = fit.problem.scene
+    if scene.body.round:
+        return False
+    last = max((s for s in fit.evaluation.segments if s.trial == index), key=lambda s: int(s.frames[-1]))
+    predicted = record[int(last.frames[-1]) - begin, 3:7]
+    return another_side_up(last.record[-1, 3:7], predicted, np.asarray(scene.capture.ground.unit_normal))
 
 
 def _own_noise(seen: ObservedBody) -> float:
