@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...sim.diagnose.capture import Camera, Capture, Trial
 from ...sim.diagnose.capture_checks import check_capture
-from ...sim.diagnose.track.pose_estimation import FLOOR_PX, Located, Pose, cast, locate, pose_scatter
+from ...sim.diagnose.track.pose_estimation import FLOOR_PX, Located, Pose, cast, locate, rigid_noise
 from ...sim.diagnose.track.track_input import (
     SceneBody,
     belief_warnings,
@@ -238,7 +238,7 @@ def _lifted(
         rest_points=rest[used],
     )
     rigid = used & np.array([i >= 0 and everything[int(i)].rigid for i in owner])
-    sigma = pose_scatter(residual[:, rigid]) if rigid.any() else None
+    sigma = rigid_noise(residual[:, rigid], read.pixels[:, rigid]) if rigid.any() else None
     return trial, sigma
 
 

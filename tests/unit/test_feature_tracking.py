@@ -131,6 +131,26 @@ def test_scatter_is_estimated(sigma, seed):
     assert pose_scatter(noise) == pytest.approx(sigma / np.sqrt(1 - 6 / 48), rel=0.1)
 
 
+@given(st.floats(0.06, 1.0), st.floats(0.0, 0.05), st.integers(0, 100))
+@settings(max_examples=15, deadline=None)
+def test_the_noise_of_a_body_that_mostly_rests_is_that_of_its_motion(moving, still, seed):
+    """A cup that hops for 6 of 48 frames scattered by 0.05 px in all, and by six times that in the air."""
+    rng = np.random.default_rng(seed)
+    hop = np.where((np.arange(48) >= 2) & (np.arange(48) < 8), moving, still)
+    noise = rng.normal(size=(48, 30, 2)) * hop[:, None, None]
+    way = np.cumsum(np.where((np.arange(48) >= 2) & (np.arange(48) < 9), 5.0, 0.0))
+    places = noise + way[:, None, None]
+    found = rigid_noise(noise, places)
+    # Frames 1 and 8 move as well, towards the next and from the last one: 6 of 8 carry the noise.
+    assert found == pytest.approx(np.sqrt((6 * moving**2 + 2 * still**2) / 8 / (1 - 6 / 60)), rel=0.15)
+    assert np.isfinite(while_moving(noise, places)).all(axis=(1, 2)).nonzero()[0].tolist() == list(range(1, 9))
+    # A single wild frame does not decide.
+    noise[4] *= 50
+    assert rigid_noise(noise, places) < 2 * found
+    assert rigid_noise(noise, np.zeros_like(noise)) == pose_scatter(noise)
+    assert rigid_noise(noise[:, :4], places[:, :4]) is None
+
+
 def test_a_pose_that_is_continued_for_long_stays_a_rotation():
     """What rounding leaves of a rotation grew 2.4 times a frame: a cup at rest was lost after 40 frames."""
     turn = Rotation.from_rotvec([0.01, -0.02, 0.03])

@@ -65,6 +65,17 @@ def test_points_are_followed_to_a_tenth_of_a_pixel(tossed):
     assert found.max() < 3.0
 
 
+def test_the_noise_is_that_of_moving_frames(tossed):
+    """It was 0.4 times that: a median over frames at rest and points that are found well."""
+    trial = tossed[1].trial
+    away = (trial.pixels - truth(trial, toss))[5:]
+    error = float(np.sqrt(np.nanmean(away**2)))
+    # The error that all points of a frame share moves the fitted pose and is not seen.
+    common = float(np.sqrt(np.nanmean(np.nanmean(away, axis=1) ** 2)))
+    assert 0.8 * np.sqrt(error**2 - common**2) < tossed[1].noise_sigma < 1.1 * error
+    assert common < 0.6 * error
+
+
 def test_tracking_writes_a_capture_of_the_scene(cube, tossed, tmp_path):
     stage, folder = cube
     path, tracked = tossed

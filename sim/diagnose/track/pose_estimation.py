@@ -194,6 +194,46 @@ def pose_scatter(residual: Array) -> float | None:
     return 1.4826 * float(np.median(np.abs(values))) / float(np.sqrt(share))
 
 
+MOVING_PX = 0.5
+"""Way per frame in px from which a body moves: patches are blurred, and found between pixels."""
+
+OUTLYING = 3.0
+"""A frame's noise counts at most as this many times that of the median frame."""
+
+
+def while_moving(residual: Array, places: Array) -> Array:
+    """Return ``residual`` (T, K, 2) with NaN in frames in which points hardly move, nor in the one before.
+
+    places: (T, K, 2) px of the points, NaN where not seen.
+    """
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=2)
+    known = np.isfinite(steps)
+    way = np.array([float(np.median(s[k])) if k.any() else 0.0 for s, k in zip(steps, known, strict=True)])
+    moves = np.concatenate([way, [0.0]]) > MOVING_PX
+    moves[1:] |= way > MOVING_PX
+    return np.where(moves[:, None, None], residual, np.nan)
+
+
+def rigid_noise(residual: Array, places: Array) -> float | None:
+    """Return the noise of a coordinate in px of points of a rigid body; None with too few points.
+
+    residual: (T, K, 2) px about fitted poses. places: (T, K, 2) px. Where the body moves the noise is that of moving
+    frames: at rest, the same patch is found at the same place in every frame, to hundredths of a pixel. What all points
+    have in common moves the pose, and is not seen. Never less than ``pose_scatter``.
+    """
+    least = pose_scatter(residual)
+    moving = while_moving(residual, places)
+    seen = np.isfinite(moving).all(axis=2)
+    count = seen.sum(axis=1)
+    squares = np.sum(np.where(seen[..., None], moving, 0.0) ** 2, axis=(1, 2))
+    # Outlying points are part of it, unlike in a median: a fit squares them.
+    frames = (squares / np.maximum(2 * count - 6, 1))[count >= LEAST_POINTS]
+    if least is None or len(frames) == 0:
+        return least
+    frames = np.minimum(frames, OUTLYING**2 * float(np.median(frames)))
+    return max(least, float(np.sqrt(np.mean(frames))))
+
+
 def jitter(residual: Array) -> float | None:
     """Return the frame-to-frame noise in px of ``residual`` (T, K, 2); None with too few points.
 

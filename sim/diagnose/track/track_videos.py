@@ -22,7 +22,7 @@ from ..capture_checks import check_capture
 from .body_tracker import BodyTracker, View
 from .feature_tracking import EVERY, CameraMotionCheck
 from .initial_pose import InitialPose, find_initial_poses, load_scene_photo, no_texture
-from .pose_estimation import FLOOR_PX, LEAST_POINTS, Array, Pose, Surface, jitter, pose_scatter, silhouette
+from .pose_estimation import FLOOR_PX, LEAST_POINTS, Array, Pose, Surface, jitter, rigid_noise, silhouette, while_moving
 from .track_input import (
     SceneBody,
     TrackOptions,
@@ -435,12 +435,12 @@ class _Run:
             places = _padded([row[i] for row in self._places], len(tracker.rest))
             residual = _padded([row[i] for row in self._residuals], len(tracker.rest))
             kept = tracker.trusted & (np.isfinite(places).all(axis=2).sum(axis=0) >= min(LEAST_FRAMES, count))
-            places, residual = np.where(tracker.trusted[:, None], places, np.nan), residual[:, tracker.trusted]
+            places = np.where(tracker.trusted[:, None], places, np.nan)
             self._check_seen(tracker, places, count)
             pixels.append(places[:, kept])
             rest.append(tracker.rest[kept])
             index.append(np.full(int(kept.sum()), i, dtype=np.int64))
-            sigmas.append(self._sigma(tracker, residual))
+            sigmas.append(self._sigma(tracker, residual[:, tracker.trusted], places[:, tracker.trusted]))
         return TrackedVideo(
             trial=Trial(
                 name=trial.trial_name,
@@ -473,19 +473,17 @@ class _Run:
                 f"{self._trial.start_frame + int(gone[0])}"
             )
 
-    def _sigma(self, tracker: BodyTracker, residual: Array) -> float:
+    def _sigma(self, tracker: BodyTracker, residual: Array, places: Array) -> float:
         """Return the noise of a coordinate: about the rigid pose, or from frame to frame for deformable bodies."""
-        name = tracker.body.source.name
-        about_pose, fast = pose_scatter(residual), jitter(residual)
-        if tracker.body.rigid:
-            sigma = about_pose if about_pose is not None else FLOOR_PX
-            if sigma > MISFIT_PX:
-                self._warnings.append(
-                    f"points of {name!r} lie {sigma:.1f} px off any rigid motion of its mesh: its mesh or the camera "
-                    "is not quite right; a diagnosis cannot resolve less than that"
-                )
-            return sigma
-        return fast if fast is not None else FLOOR_PX
+        if not tracker.body.rigid:
+            return max(jitter(residual) or FLOOR_PX, jitter(while_moving(residual, places)) or FLOOR_PX)
+        sigma = rigid_noise(residual, places) or FLOOR_PX
+        if sigma > MISFIT_PX:
+            self._warnings.append(
+                f"points of {tracker.body.source.name!r} lie {sigma:.1f} px off any rigid motion of its mesh: its mesh "
+                "or the camera is not quite right; a diagnosis cannot resolve less than that"
+            )
+        return sigma
 
 
 def _padded(rows: Sequence[Array], count: int) -> Array:
