@@ -139,8 +139,8 @@ def _words(report, page, dropped, lands):
         if gap["resolvable"] and gap["before_rms_m"] < gap["grain_rms_m"] and "chaotic" not in page:
             yield "a share of a gap within the simulator's own uncertainty, unsaid"
         if gap["refitted_rms_m"] <= gap["after_rms_m"]:
-            better = gap["refitted_rms_m"] < 0.9 * gap["after_rms_m"]
-            if f"own parameters does {'better' if better else 'as well'}" not in page:
+            how = "better" if gap["refitted_rms_m"] < 0.9 * gap["after_rms_m"] else "as well"
+            if not re.search(rf"own parameters\b[^.]*? does {how}", page):
                 yield "re-fitting does as well or better, unsaid"
         beaten = [v for v in report["controls"].values() if v is not None and v <= gap["after_rms_m"]]
         if beaten and "not a cause" not in page:
