@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
+from .floor_limbs import with_limbs
 from .inflate import Silhouette
 from .lying import lying_surface, ring_lies
 from .reference_surfaces import ReferenceSurface, measured_surfaces, reference_surfaces, standing_surfaces
@@ -201,20 +202,23 @@ def _standing_mesh(
         choices = reference_surfaces(camera, silhouette)
     else:
         choices = chain(standing_surfaces(camera, silhouette), reference_surfaces(camera, silhouette))
-    on_legs = False
+    on_legs = best_stands = False
     for reference in choices:
         # Moved back, legs would become flaps on the ground: only what would topple otherwise is.
         if on_legs and reference.middle is None and best is not None and best[4] > 0.0:
             break
-        on_legs |= front is None and reference.middle is not None
+        standing = front is None and reference.middle is not None
+        on_legs |= standing
         if flat:
             reference = replace(reference, back=FLAT)
+        elif reference.middle is None and not silhouette.slab:
+            reference = with_limbs(reference, silhouette)
         field = _DepthField(silhouette, reference)
         points, faces, lost = surface_of_size(field, float(silhouette.mask.sum()), target)
         # One round brings the base onto the ground; the rest is for the one that is taken.
         points = relax(field, points, faces, 1)
         body = _to_world(silhouette, reference, points, faces)
-        if front is None and reference.middle is not None:
+        if standing:
             # Longer feet change little else, so they may be as long as the margin wants them, on the ground as a whole.
             settled_feet = settled(camera, silhouette, body.vertices, body.faces)
             steadiness, enough = support_of(settled_feet, body.faces).share, 1.0
@@ -222,6 +226,7 @@ def _standing_mesh(
             steadiness, enough = support_of(body.vertices, body.faces).steadiness, STABLE
         if best is None or steadiness > best[4]:
             best = (reference, points, faces, lost, steadiness)
+            best_stands = standing
         # A relief need not stand by itself, as long as it touches the ground: moving it back only enlarges it.
         if steadiness >= enough or (flat and steadiness > -1.0):
             break
@@ -230,7 +235,7 @@ def _standing_mesh(
     points = relax(_DepthField(silhouette, reference), points, faces, RELAXATION_ROUNDS - 1)
     body = _to_world(silhouette, reference, points, faces)
     if not flat:
-        body = _footed(camera, silhouette, body, on_legs=front is None and reference.middle is not None)
+        body = _footed(camera, silhouette, body, on_legs=best_stands)
     return body, support_of(body.vertices, body.faces).steadiness, lost
 
 

@@ -54,6 +54,7 @@ class SupportMargin:
     height: float
     volume: float
     longest: float
+    foot: Points
 
     @property
     def steadiness(self) -> float:
@@ -85,7 +86,7 @@ def support_of(vertices: Points, faces: NDArray[np.int64]) -> SupportMargin:
     volumes = np.einsum("ti,ti->t", a, np.cross(b, c))
     total = float(volumes.sum())
     centre = vertices.mean(axis=0) + ((a + b + c) * volumes[:, None]).sum(axis=0) / (4.0 * total)
-    stands = SupportMargin(-np.inf, 0.0, float(extent[2]), abs(total) / 6.0, float(extent.max()))
+    stands = SupportMargin(-np.inf, 0.0, float(extent[2]), abs(total) / 6.0, float(extent.max()), centre[:2])
     base = _base(vertices, faces, ON_BASE * stands.longest, FILM * stands.cell)
     margin, inradius = stands.margin, stands.inradius
     if len(base) >= 3:
@@ -147,6 +148,12 @@ UNDER = (0.1, 0.5)
 """Downward part of the normal between which a vertex belongs to the underside."""
 HIDDEN_PX = 2.0
 """Least distance inside the outline of where settled vertices are seen."""
+SEATS = (0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+"""Radii of the part of the underside that settles, over the wanted margin, to try before all of it does."""
+BEHIND = (0.0, 0.5, 1.0)
+"""Distances of its middle behind the foot of the centre of mass, over the wanted margin."""
+SEAT_EDGE = 0.4
+"""Width of the seat's edge over the body's half thickness."""
 FALLS = 8
 """Steps in which settling is tried."""
 LYING = 0.8
@@ -175,6 +182,7 @@ def footed(
     """
     plain = support_of(vertices, faces)
     best, highest = vertices, plain.share
+    chosen: tuple[float, bool] | None = None
     if highest < 1.0:
         thicken = _Thickening(camera, silhouette, vertices, faces)
         # An upright back is preferred, but a body on legs stays as thick as it is.
@@ -186,10 +194,26 @@ def footed(
                 score = (1.0 if on_legs else SAFE) if stands.share >= 1.0 else stands.share
                 score -= COST * (stands.volume / plain.volume - 1.0) + worse
                 if score > highest:
-                    best, highest = made, score
+                    best, highest, chosen = made, score, (extra, low)
                 if stands.share >= 1.0:
                     break
+        if chosen is not None and not flat:
+            best = _on_a_seat(thicken, best, faces, *chosen)
     return best, (best != vertices).any(axis=1)
+
+
+def _on_a_seat(thicken: _Thickening, whole: Points, faces: NDArray[np.int64], extra: float, low: bool) -> Points:
+    """``whole`` (V, 3), thickened by ``extra``, with no more of its underside settled than it needs to stand as well:
+    a round seat below its centre of mass, or a curtain would hang from it to the ground."""
+    stands = support_of(whole, faces)
+    enough = min(stands.share, 1.0)
+    for radius in SEATS:
+        for behind in BEHIND:
+            seat = stands.foot + behind * stands.wanted * thicken.away
+            made = thicken.by(extra, low=low, seat=(seat, radius * stands.wanted))
+            if support_of(made, faces).share >= enough:
+                return made
+    return whole
 
 
 def settled(camera: Camera, silhouette: Silhouette, vertices: Points, faces: NDArray[np.int64]) -> Points:
@@ -220,14 +244,18 @@ class _Thickening:
         height = vertices[:, 2] / vertices[:, 2].max()
         whole = np.where(unseen, np.minimum(share / WHOLE, 1.0), 0.0)
         self._height = np.clip(height, 0.0, 1.0)
+        self._thick = half
+        towards = vertices[:, :2].mean(axis=0) - camera.position[:2]
+        self.away = towards / max(float(np.linalg.norm(towards)), 1e-300)
         self._step = half * whole / np.linalg.norm(self._rays, axis=1)
         self._settle = whole * smoothstep(-normals[:, 2], *UNDER) * smoothstep(height, *SETTLED)
         self._room = np.maximum(ground_depth(camera, self._rays) - projected[:, 2], 0.0)
 
-    def by(self, extra: float, *, low: bool, flat: bool = False) -> Points:
+    def by(self, extra: float, *, low: bool, flat: bool = False, seat: tuple[Points, float] | None = None) -> Points:
         """Return the vertices (V, 3) with ``extra`` half thicknesses added and settled, none below the ground.
 
         low: only low down, less and less towards a height that rises with ``extra``. flat: the same at all heights.
+        seat: middle (2,) and radius of what settles; None for all of the underside.
         """
         if flat:
             profile = np.ones_like(self._height)
@@ -242,7 +270,7 @@ class _Thickening:
             low_rows = np.flatnonzero((moved > 0.0) & (made[:, 2] < LOWERED * made[:, 2].max()))
             below = made[low_rows] * (1.0, 1.0, 0.0)
             made[low_rows[self._inside(below) > HIDDEN_PX], 2] = 0.0
-        return self._settled(made)
+        return self._settled(made, seat)
 
     def _inside(self, points: Points) -> Points:
         """Pixels (n,) inside the outline at which ``points`` (n, 3) are seen."""
@@ -250,14 +278,19 @@ class _Thickening:
         inside = ndimage.map_coordinates(self._silhouette.distance, at[:, ::-1].T, order=1, mode="nearest")
         return np.asarray(inside, dtype=np.float64)
 
-    def _settled(self, made: Points) -> Points:
-        fallen, open_ = np.zeros(len(made)), self._settle > 0.0
+    def _settled(self, made: Points, seat: tuple[Points, float] | None) -> Points:
+        settle = self._settle
+        if seat is not None:
+            middle, radius = seat
+            away = np.linalg.norm(made[:, :2] - middle, axis=1)
+            settle = settle * smoothstep(away, radius + SEAT_EDGE * self._thick, radius)
+        fallen, open_ = np.zeros(len(made)), settle > 0.0
         for fall in np.arange(1, FALLS + 1) / FALLS:
             inside = self._inside(made[open_] * (1.0, 1.0, 1.0 - fall))
             open_[np.flatnonzero(open_)[inside < HIDDEN_PX]] = False
             fallen[open_] = fall
         # What nearly lies does.
-        made[:, 2] *= 1.0 - np.minimum(self._even(fallen * self._settle) / LYING, fallen)
+        made[:, 2] *= 1.0 - np.minimum(self._even(fallen * settle) / LYING, fallen)
         return made
 
     def _even(self, share: Points) -> Points:

@@ -22,6 +22,7 @@ from ...smoothstep import smoothstep
 from ..mesh_raster import rasterise
 from .body_texture import CropTexture, TexturedSurface, distance_behind, seen_vertices
 from .even_light import light_on
+from .hidden_seams import blended
 from .inflated_mesh import BodyMesh
 from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_grain
 from .surface_charts import surface_frame, unwrap
@@ -99,10 +100,12 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
     values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
     size_px = float(np.sqrt(inside.sum()))
-    behind = _smoothed(body, distance_behind(body, seen_vertices(camera, body), size_px))
+    seen = seen_vertices(camera, body)
+    behind = _smoothed(body, distance_behind(body, seen, size_px))
     # Beyond an edge, light is another one at once.
     values = np.column_stack([values, np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), values[:, 11])])
     light = light_on(camera, body, texture, inside)
+    values = np.column_stack([values, _without_seams(body, seen, values, texture, matter, light, size_px)])
     values = values[charts.source]
     if body.corner_colours is not None:
         values[charts.faces, 6:8] = body.corner_colours[~photo]
@@ -228,6 +231,26 @@ def _cropped(mask: Mask, texture: CropTexture) -> Mask:
     return mask[texture.top : texture.top + height, texture.left : texture.left + width]
 
 
+def _without_seams(
+    body: BodyMesh,
+    seen: Mask,
+    values: Points,
+    texture: CropTexture,
+    matter: PlainMatter,
+    light: NDArray[np.float32],
+    size: float,
+) -> Points:
+    """Colours and their share (V, 4) around seams between counterparts, which a box has at its edges only.
+
+    values: (V, 13) as those of ``_colours``.
+    """
+    like = values[:, 6:8] - (texture.left + 0.5, texture.top + 0.5)
+    plain = _without_light(_sampled(matter.colours, like), values[:, 12:13] * _sampled(light, like))
+    if body.corner_colours is not None:
+        return np.column_stack([plain, np.zeros(len(plain))])
+    return np.column_stack(blended(body, seen, like, plain, size))
+
+
 def _colours(
     camera: Camera,
     texel: Points,
@@ -238,8 +261,8 @@ def _colours(
     frame: Points,
     pixels: float,
 ) -> NDArray[np.float64]:
-    """Colours (P, 3) of texels (P, 13): place, normal, counterpart's pixel, own pixel, share hidden, flatness, share of
-    the counterpart's light that is taken out.
+    """Colours (P, 3) of texels (P, 17): place, normal, counterpart's pixel, own pixel, share hidden, flatness, share of
+    the counterpart's light that is taken out, colour without seams, share of that.
 
     mask: (h, w) the object in ``texture``. light: (h, w, 3) its logarithm. pixels: of the photo per unit of length.
     """
@@ -248,7 +271,8 @@ def _colours(
     like, own = texel[:, 6:8] - corner, texel[:, 8:10] - corner
     grain = _grain(matter, texel[:, :3] @ frame.T * pixels, normal @ frame.T)
     grain *= _sampled(matter.contrast[..., None], like)
-    plain = _without_light(_sampled(matter.colours, like), texel[:, 12:13] * _sampled(light, like)) + grain
+    plain = _without_light(_sampled(matter.colours, like), texel[:, 12:13] * _sampled(light, like))
+    plain += texel[:, 16:17] * (texel[:, 13:16] - plain) + grain
     towards = camera.position - texel[:, :3]
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
     depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
@@ -277,7 +301,7 @@ def _colours(
 
 
 def _cover(camera: Camera, texel: Points, texture: CropTexture) -> NDArray[np.float64]:
-    """Alpha (P,), 0 to 255, of texels (P, 13; see ``_colours``): the photo's where they face its camera, else full."""
+    """Alpha (P,), 0 to 255, of texels (P, 17; see ``_colours``): the photo's where they face its camera, else full."""
     assert texture.alpha is not None
     own = texel[:, 8:10] - (texture.left + 0.5, texture.top + 0.5)
     towards = ((camera.position - texel[:, :3]) * texel[:, 3:6]).sum(axis=1) > 0
