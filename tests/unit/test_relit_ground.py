@@ -42,6 +42,21 @@ def shaded_table():
     return photo, truth, disc(140, 105, 54) | disc(90, 80, 36), thing
 
 
+def test_light_is_not_put_back_in_colours_that_are_nowhere_around():
+    """Above a plain table the room turns from grey to orange; a polynomial goes on from there to blue."""
+    rows = np.arange(HEIGHT, dtype=np.float32)[:, None, None]
+    turn = np.clip((60.0 - rows) / 60.0, 0.0, 1.0)
+    truth = 130.0 * np.exp(turn * np.array([0.3, 0.0, -0.8], np.float32)).repeat(WIDTH, axis=1)
+    truth += np.random.default_rng(0).normal(scale=2.0, size=(HEIGHT, WIDTH, 1)).astype(np.float32)
+    hole, thing = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool)
+    hole[62:, 24:], thing[62:150, 110:180] = True, True
+    photo = truth * (1.0 - 0.15 * soft(hole, 5.0))
+    photo[thing] = (200.0, 200.0, 205.0)
+    given, left = relit(photo, hole, np.zeros_like(hole), thing)
+    # The shadow itself is 20 of 255, and the noise at most 8.
+    assert np.abs(given - truth)[hole & ~left].max(initial=0.0) < 28.0
+
+
 def test_a_membrane_continues_a_slope_and_stays_away_from_what_touches_nothing():
     slope = (0.3 * np.arange(40)[None, :] + 0.1 * np.arange(30)[:, None]).astype(np.float32)[..., None]
     free = np.zeros((30, 40), dtype=bool)

@@ -65,6 +65,41 @@ def test_a_shadow_does_not_take_a_dark_thing_beside_the_object():
     assert (found.stay & shade).mean() == 0.0
 
 
+def table_beside_a_ball():
+    """A ball before a wall, and beside it a red table, of which the range that is looked at may cut a side: photo,
+    masks of ball, table, and wall."""
+    picture = plain()
+    wall, table, ball = np.zeros((3, HEIGHT, WIDTH), bool)
+    wall[:34] = True
+    table[60:72, 132:], table[60:140, 132:142], table[60:140, 200:210] = True, True, True
+    ball = disc(100, 96, 24)
+    picture[wall], picture[table], picture[ball] = (90.0, 130.0, 170.0), (200.0, 40.0, 30.0), (40.0, 150.0, 60.0)
+    return np.clip(picture, 0, 255).astype(np.uint8), ball, table, wall
+
+
+def test_furniture_beside_an_object_stays_and_lends_no_colour():
+    picture, ball, table, wall = table_beside_a_ball()
+    found = unboxed_things(picture, [ball], CAMERA)
+    assert (found.whole & table).sum() > 0.9 * table.sum()
+    # Neither the ground under it nor the wall, which may go on behind the ball.
+    around = cv2.dilate(table.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert not (found.stay & ~around).any() and not (found.stay & wall).any()
+    # A hole that would take a leg.
+    (hole,) = object_holes([ball], [disc(122, 110, 30)], 4.0, found.stay)
+    assert not (hole & table).any()
+
+
+def test_ground_beside_a_thing_has_the_ground_s_level_and_not_the_thing_s():
+    picture, bar, hole = plain()[:72, :96], np.zeros((72, 96), bool), disc(36, 36, 16, (72, 96))
+    bar[8:66, 48:56] = True
+    picture[bar] = (200.0, 40.0, 30.0)
+    view = camera_above_ground(96, 72, 100.0, math.radians(50.0))
+    nothing = np.zeros_like(hole)
+    plate = fill_background(np.clip(picture, 0, 255).astype(np.uint8), hole & ~bar, nothing, view, barred=bar)
+    redder = plate[..., 0].astype(int) - plate[..., 1] - (150 - 120)
+    assert redder[hole & ~bar].max() < 12
+
+
 @pytest.mark.parametrize("pattern", ["checks", "stripes", "noise", "gradient"])
 def test_the_pattern_of_the_ground_is_no_thing(pattern):
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]

@@ -50,7 +50,7 @@ def blend(
 
     objects: (H, W), must not show through the transition. Where there is room between them and the border of the hole,
     the photo fades out there; a difference of level along the border is compensated. shade: (H, W) shadow outside of
-    the hole, whose level is ignored.
+    the hole, or other things, whose level is ignored.
     """
     if not hole.any():
         return photo.copy()
@@ -225,7 +225,7 @@ def fill_background(
         shade |= dark
         _fill_part(filling, part, open_hole, barred, dark, objects, changed, camera, options, notice)
         open_hole &= ~part
-    return blend(pixels, filling, hole, objects, shade)
+    return blend(pixels, filling, hole, objects, shade | barred)
 
 
 def _widened(mask: Mask, radius: int) -> Mask:

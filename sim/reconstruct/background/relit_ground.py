@@ -5,8 +5,8 @@ A shadow, or a mirror image that was not wholly taken out, changes the ground's 
 What the level should be is continued from the border of the hole as a membrane (Pérez et al., Poisson image editing,
 SIGGRAPH 2003) over a smooth field of light. The lack is the difference, smoothed at each place over the largest scale
 that explains it as well as finer ones do, by the deviations that the surface's own pattern has at these scales
-(Lepski's rule). Where the lack is too deep, changes too suddenly, or leaves colours that the surface has nowhere, the
-place is inpainted.
+(Lepski's rule). Where the lack is too deep, changes too suddenly, or leaves colours that the surface or the border of
+the hole has nowhere, the place is inpainted.
 """
 
 from __future__ import annotations
@@ -40,6 +40,11 @@ LEAST = 0.015
 """Smallest deviation in logarithms: below it is noise."""
 DEEPEST = 0.5
 """Lack in logarithms of sRGB values, a third of the light, above which noise and the shadow's own tint would show."""
+BEYOND = np.array([0.2, 0.1, 0.1], dtype=np.float32)
+"""Most by which the level, which follows a smooth field of light, may leave the membrane of the colours around the
+hole, in logarithms, along ``AXES``: a field is a polynomial, and goes off where little is seen."""
+MOSTLY = 0.3
+"""Share of the ground that could be put back beyond that, above which the field tells nothing."""
 SLIVER = 0.02
 """Half the least width over the hole's size of a part whose light is put back."""
 FEWEST = 40
@@ -212,8 +217,11 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     slow, _ = light_field(cells.logs, cells.known, cells.hole)
     pattern = cells.logs - slow
     # The border's level, not its single pixels, is continued inside.
-    border = smoothed(pattern, cells.known, max(1.0, SCALES[-1] * cells.side))
-    level = membrane(np.where(cells.known[..., None], border, 0.0).astype(np.float32), cells.known, cells.hole)
+    both = np.concatenate([pattern, cells.logs], axis=-1).astype(np.float32)
+    border = smoothed(both, cells.known, max(1.0, SCALES[-1] * cells.side))
+    both = membrane(np.where(cells.known[..., None], border, 0.0).astype(np.float32), cells.known, cells.hole)
+    level, around_it = both[..., :3], both[..., 3:]
+    beyond = (np.abs((slow + level - around_it) @ AXES.T) > BEYOND).any(axis=-1)
     ground = cells.known | (cells.hole & ~cells.core)
     difference = np.where(ground[..., None], level - pattern, 0.0).astype(np.float32)
     blurs = [max(1.0, scale * cells.side) for scale in SCALES]
@@ -239,6 +247,8 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     own = axes - level @ AXES.T + lack
     strange = np.abs(own) > STRANGE * np.maximum(_spread((axes - usual[0])[around]), 2.0 * LEAST)
     trusted = ~strange.any(axis=-1) & (np.abs(lack[..., 0]) < DEEPEST) & ~cells.core & ~sudden
+    told = trusted & cells.hole
+    trusted &= ~beyond & ((told & beyond).sum() <= MOSTLY * told.sum())
     # Between what is inpainted, slivers of the photo would be islands.
     wide = 2 * max(1, round(SLIVER * cells.side)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))

@@ -54,6 +54,8 @@ PATTERN = 0.55
 SHADE_TINT = 0.2
 """Log chroma that a shadow changes at most, over its depth: shadows under a sky are bluish, black is never quite
 black."""
+ON_GROUND = 0.25
+"""Share of a row of the range that is ground, from which what stands in that row may stand before more of it."""
 HIDDEN = 0.1
 """Share of a thing's outline along an object above which the thing continues behind it."""
 
@@ -181,6 +183,8 @@ def _things(logs: Values, open_ground: Mask, covered: Mask, area: float) -> tupl
             for piece in pieces
             if len(pieces) > 1 and _is_thing(piece, apart, open_ground, covered, area, beside=part & ~piece)
         ]
+    rest = different & ~shade & ~np.logical_or.reduce([np.zeros_like(different), *found])
+    found += _furniture(parts, rest, different, apart, open_ground, covered, area)
     if not found or sum(int(part.sum()) for part in found) > PATTERN * open_ground.sum():
         return [], different
     if len(found) >= 3 and _is_pattern(off, open_ground, found):
@@ -284,6 +288,33 @@ def _is_thing(
     if outside.sum() < 8:
         return False
     return float((apart[outside] < 0.7).mean()) > SHARP and float(np.median(apart[part])) > 1.0
+
+
+def _furniture(
+    parts: Sequence[Mask],
+    rest: Mask,
+    different: Mask,
+    apart: Values,
+    open_ground: Mask,
+    covered: Mask,
+    area: float,
+) -> list[Mask]:
+    """What of ``parts`` (h, w) stands on the ground with legs, or goes on beyond the range, as a chair beside another.
+
+    It is no thing by its form, so only its own pixels count, ``rest``, and only in rows in which much is ground: a wall
+    or another surface begins where there is none. different: all that differs from the ground.
+    """
+    ground = (open_ground & ~different).sum(axis=1) >= ON_GROUND * np.maximum(open_ground.sum(axis=1), 1)
+    result = []
+    for part in parts:
+        own = part & rest & ground[:, None]
+        if own.sum() < SMALLEST * area or _contact(own, covered) > HIDDEN:
+            continue
+        outside = (cv2.dilate(own.astype(np.uint8), _disc(3)) > 0) & ~(cv2.dilate(own.astype(np.uint8), _disc(2)) > 0)
+        outside &= open_ground & ground[:, None] & ~rest
+        if outside.sum() >= 8 and float((apart[outside] < 0.7).mean()) > SHARP:
+            result.append(own)
+    return result
 
 
 def _outline(part: Mask) -> Mask:
