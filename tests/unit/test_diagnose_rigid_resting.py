@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +13,7 @@ from physgen.sim.diagnose.rigid import fit_rigid
 from physgen.sim.diagnose.rigid.observed_poses import as_matrix, fit_rotation, from_rotvec, observe_body, project
 from physgen.sim.diagnose.rigid.resting_contact import height, resting_state
 from physgen.sim.diagnose.rigid.rigid_candidates import BodyScene
+from physgen.sim.diagnose.rigid.rigid_prediction import middle_frame
 from physgen.sim.diagnose.rigid.rigid_search import body_problem
 from physgen.sim.diagnose.rigid.rigid_simulator import rigid_body
 from physgen.sim.diagnose.work import Work
@@ -136,6 +139,13 @@ def test_a_ball_that_rolls_from_the_start_does_not_seem_to_rise():
 def test_a_ball_that_leaves_the_ground_rises():
     for trial in body_problem(rolling(rise=0.8, frames=20), 0, Work()).trials:
         assert trial.states[0][9] == pytest.approx(0.8, abs=0.03)
+
+
+def test_a_long_rest_does_not_take_the_half_that_judges():
+    """Of a cup that hops for 0.3 of 2 s the later half was rest that is not fitted, and no error was held out."""
+    (trial, _) = body_problem(rolling(), 0, Work()).trials
+    assert trial.end == 60 and middle_frame(trial) == 30
+    assert middle_frame(dataclasses.replace(trial, end=12)) == 6
 
 
 def test_nothing_is_missing_where_a_ball_rolls():

@@ -262,9 +262,9 @@ def leave_one_out(fit: Fit) -> Array:
     return np.array(found)
 
 
-def _middle(trial: SegmentedTrial) -> int:
-    """Return the frame at half of the time of ``trial``, at least the third and not the last."""
-    times = trial.observations.times
+def middle_frame(trial: SegmentedTrial) -> int:
+    """Return the frame at half of the time of ``trial`` that is fitted, at least the third and not the last."""
+    times = trial.observations.times[: trial.end]
     return int(np.clip(np.searchsorted(times, 0.5 * (times[0] + times[-1])), 3, max(len(times) - 1, 3)))
 
 
@@ -272,7 +272,7 @@ def _from_first_half(fit: Fit, index: int) -> Array:
     """Return numbers (P,) fitted without the second half of trial ``index``, the only complete one."""
     trials, states = list(fit.problem.trials), list(fit.states)
     trial = trials[index]
-    end = min(_middle(trial), trial.end)
+    end = min(middle_frame(trial), trial.end)
     kept = max(1, sum(n < end - 2 for n in trial.nodes))
     end = min([end, *trial.nodes[kept : kept + 1]])
     weights = list(trial.weights[:kept])
@@ -317,7 +317,7 @@ def score_held_out(fit: Fit, spread: Array | None = None) -> HeldOutScore:
         off = (trial.observations.seen if trial.observations.camera is None else _tracked_points(fit, i))[
             begin:
         ] - points
-        first = _middle(trial) if len(alone) == 1 else shown_frames(fit, trial)
+        first = middle_frame(trial) if len(alone) == 1 else shown_frames(fit, trial)
         off = off[max(0, first - begin) :]
         squares.append(np.sum(off**2, axis=-1).ravel())
         if spread is not None and np.isfinite(spread[i]) and np.isfinite(squares[-1]).any():
