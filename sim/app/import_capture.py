@@ -29,6 +29,8 @@ FREE_FALL = (7.0, 12.5)
 
 LONGEST_STEP_S, FARTHEST_M, NEAREST_M = 0.5, 100.0, 0.005
 """Median time step, and extent of the motion, beyond which the units are doubted."""
+LONGEST_TAKE_S, LARGEST_M = 1e6, 1e6
+"""What no recording of a body reaches, whatever its units: numbers beyond are damage, and their squares overflow."""
 
 AXES: Mapping[str, tuple[tuple[int, float], ...]] = {
     "z": ((0, 1.0), (1, 1.0), (2, 1.0)),
@@ -227,7 +229,10 @@ def _times(table: RecordedTable, request: ImportRequest, settle: Callable[[str, 
             settle(f"take {table.name!r}: the times look like {unit}: a step of {step:g}", f"--time-unit {unit}")
     if unit not in UNITS:
         raise InputError(f"take {table.name!r}: times in {unit!r}: give --time-unit s, ms, us or ns")
-    return (times - times[0]) * UNITS[unit]
+    times = (times - times[0]) * UNITS[unit]
+    if not times[-1] <= LONGEST_TAKE_S:
+        raise InputError(f"take {table.name!r}: lasts {times[-1]:.3g} s: check its times, or give --time-unit")
+    return times
 
 
 def _lengths(
@@ -254,7 +259,12 @@ def _lengths(
         factors = UNITS[unit] * np.ones(3)
     else:
         raise InputError(f"lengths in {unit!r}: give --length-unit m, cm or mm")
-    return [(t.points * factors)[..., [0, 2, 1]] if t.planar else t.points * factors for t in tables]
+    found = [(t.points * factors)[..., [0, 2, 1]] if t.planar else t.points * factors for t in tables]
+    for table, points in zip(tables, found, strict=True):
+        farthest = float(np.nanmax(np.abs(points), initial=0.0))
+        if not farthest <= LARGEST_M:
+            raise InputError(f"take {table.name!r}: a point is {farthest:.3g} m away: check it, or give --length-unit")
+    return found
 
 
 def _upright(

@@ -78,6 +78,18 @@ def test_what_looks_wrong_is_refused_unless_somebody_says_so(tmp_path, change, o
     np.testing.assert_allclose(load_capture(tmp_path / "asked").trials[0].points[:, 0], throw(), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("times", "metres", "words"), [(1e300, 0, "lasts 1e"), (0, 1e300, "a point is 1e"), (0, 1e9, "m away")]
+)
+def test_numbers_that_no_recording_has_are_named(tmp_path, times, metres, words):
+    """Their squares overflow, and a fit of a parabola to them does not converge."""
+    clock, way = TIMES.copy(), throw()
+    clock[-1], way[-1, 0] = max(clock[-1], times), way[-1, 0] + metres
+    file = table(tmp_path / "a.csv", way, times=clock)
+    with pytest.raises(InputError, match=words):
+        imported([file], tmp_path, time_unit="s", length_unit="m")
+
+
 def test_units_in_headings_count_and_takes_share_a_file(tmp_path):
     way = np.concatenate([1e3 * throw(), 1e3 * throw((1, 1, 2))])
     file = table(
