@@ -3,6 +3,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -363,6 +364,25 @@ def test_the_back_is_as_bright_on_both_sides():
     sides = [back[rows, int(middle[1] + turn * reach[1] / 4) - 8 :, :3][:, :16].mean() for turn in (-1, 1)]
     # In the photo they are 1.5 times apart.
     assert max(sides) / min(sides) < 1.15
+
+
+def test_what_comes_from_places_far_apart_blends_behind():
+    """A toy that is fur on its left and blue on its right; behind, each half has the colour of one of two pixels."""
+    photo = picture(TOY)
+    photo[TOY & (COLUMNS > 160)] = BLUE
+    mesh = body()
+    behind = ~seen_vertices(VIEW, mesh)
+    places = np.where(mesh.vertices[:, :1] > 0.0, (120.0, 150.0), (200.0, 150.0))
+    mesh = replace(mesh, colours=np.where(behind[:, None], places, mesh.colours))
+    back = seen_from(textured_body(VIEW, mesh, crop_texture(photo, TOY), TOY), 180.0).astype(float)
+    rows = np.flatnonzero(back[..., 3].any(axis=1))
+    rows = rows[len(rows) // 3 : 2 * len(rows) // 3]
+    # From one colour to the other, of which grain is a tenth.
+    red = (back[rows, :, 0] - BLUE[0]) / (FUR[0] - BLUE[0])
+    between = (red > 0.25) & (red < 0.75) & (back[rows, :, 3] > 0)
+    between[:, : 130 - 40] = between[:, 130 + 40 :] = False
+    # Faces are 4 pixels wide; the band around the seam is 21 pixels, half of which is between a quarter and three.
+    assert np.median(between.sum(axis=1)) > 6
 
 
 def test_no_flat_spots_on_a_round_side():
