@@ -5,10 +5,11 @@ The margin is that of the centre of mass inside the base. What lies on the groun
 cell holds no particle and carries nothing; it is no base.
 
 Inflated bodies are round and would stand on a spot, where real things have settled and reach farther back. What faces
-away from the camera moves farther from it along its own ray, all of it over most of the height, so that the back stays
-upright, less where the body is thin, and no farther than the ground. Then the underside of that side settles straight
-down, as far as the body hides it from the camera. Neither the front nor the outline changes. A box that is too thin to
-stand safely gets a back that is farther away, and stays a box but for its hidden edges.
+away from the camera moves farther from it along its own ray, all of it over most of the height, so that the back
+stays upright, less where the body is thin, and no farther than the ground. Then the underside of that side settles
+straight down, as far as the body hides it from the camera and as far around its centre of mass as it needs. Neither
+the front nor the outline changes. A box that is too thin to stand safely gets a back that is farther away, and stays
+a box but for its hidden edges.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ class SupportMargin:
 
     margin: from the foot of its centre of mass to the edge of the convex hull of its base, negative outside, -inf
     without a base. inradius: the same of the hull's own centre. height; volume; longest: largest extent along an axis.
+    foot: (2,) below the centre of mass.
     """
 
     margin: float
