@@ -54,6 +54,10 @@ SPREAD = 0.3
 """Least deviation of the normals, as sines: on one flat side nothing tells a highlight from paint."""
 EXPLAINED = 0.4
 """Least share of the variance of the white light that the normal explains."""
+MOST_WHITE = 0.25
+"""Share of the light from which white is no highlight but a body's own: a pale one on a coloured floor is lit by two
+colours, the floor's from below, and both follow the normal. Plush toys are at 0.3 to 0.5, an orange, clay and plastic
+at 0.13 to 0.2."""
 SMOOTH, FEW = 1.2, 0.05
 """Deviation in cells over which the map is smoothed, and pixels in a cell below which it falls to 0."""
 LEAST_LEVEL = 0.03
@@ -122,6 +126,8 @@ def find_highlights(light: NDArray[np.float32], normals: NDArray[np.floating]) -
         return None
     facing, white = normals[usable], white[usable]
     if float(np.sqrt(facing[:, :2].var(axis=0).sum())) < SPREAD:
+        return None
+    if float(white.mean()) > MOST_WHITE * float(light[usable].mean()):
         return None
     base = float(np.quantile(white, BASE))
     white = np.maximum(white - base, 0.0)

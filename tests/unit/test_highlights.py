@@ -97,3 +97,12 @@ def test_print_that_does_not_follow_the_normal_and_white_things_have_none():
     )
     white = 0.6 * np.ones((SIDE, SIDE, 3)) + highlight(normals)
     assert find_highlights(white[inside].astype(np.float32), normals[inside]) is None
+
+
+def test_a_pale_body_on_a_coloured_floor_has_none():
+    """White light from above and the floor's from below: both follow the normal, and neither mirrors a lamp."""
+    normals, inside = ball()
+    above = np.maximum(normals @ LAMP, 0)[..., None] ** 2
+    floor = np.array([0.5, 0.3, 0.16]) * (0.8 - 0.3 * normals[..., 1:2])
+    picture = linear_to_bytes((floor + 0.5 * above * np.array([0.95, 0.97, 1.0])).astype(np.float32))
+    assert find_highlights(bytes_to_linear(picture)[inside], normals[inside]) is None
