@@ -211,7 +211,9 @@ def _places(
     kind: int, rest: NDArray[np.int64], last: NDArray[np.int64], before: NDArray[np.int64]
 ) -> NDArray[np.int64] | None:
     """What the map of a ``kind`` of sample is of (V, K); None for the speed alone."""
-    return {2: rest, 3: last, 4: np.column_stack([last, before, rest]) if kind == 4 else None}.get(kind)
+    if kind == 4:
+        return np.column_stack([last, before, rest])
+    return {2: rest, 3: last}.get(kind)
 
 
 def _fit(places: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.float64]:

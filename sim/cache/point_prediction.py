@@ -64,16 +64,12 @@ def point_prediction(places: NDArray[np.int64]) -> PointPrediction:
         free = np.flatnonzero(~used)
         if size > 0:
             # One of each cell that has none yet. Cells lie within those before, so a cell has never more than one.
-            keys = _keys(places // size)
-            taken = np.unique(keys[order])
-            cells, first = np.unique(keys[free], return_index=True)
-            new = np.sort(free[first[~np.isin(cells, taken)]])
+            cells, first = np.unique(_keys(places[free] // size), return_index=True)
+            new = np.sort(free[first[~np.isin(cells, _keys(places[order] // size))]])
         else:
             new = free
         if len(order) and len(new):
-            chunks = [new[at : at + _CHUNK] for at in range(0, len(new), _CHUNK)]
-            parts = [_level(places, order, chunk, max(2 * size, 1)) for chunk in chunks]
-            columns, numbers = (np.concatenate(each) for each in zip(*parts, strict=True))
+            columns, numbers = _level(places, order, new, max(2 * size, 1))
             rows = np.repeat(np.arange(len(new)), columns.shape[1])
             entries = (numbers.ravel(), (rows, columns.ravel()))
             weights.append(sparse.csr_matrix(entries, shape=(len(new), len(order)), dtype=np.int64))
@@ -96,18 +92,21 @@ def _level(
     weights (N, K), which are 0 where there are fewer."""
     keys = _keys(places[order] // size)
     by_key = np.argsort(keys, kind="stable")
-    cells = (places[new] // size)[:, None] + _AROUND
-    wanted = _keys(cells.reshape(-1, 3)).reshape(len(new), -1)
-    at = np.searchsorted(keys[by_key], wanted).clip(max=len(keys) - 1)
-    columns = by_key[at]
-    there = keys[columns] == wanted
-    away = places[order[columns]] - places[new][:, None]
-    far = np.where(there, (away**2).sum(axis=2), np.int64(1) << 60)
-    # Stable, so that of equally far ones the one in the earlier cell comes first on every machine.
-    nearest = np.argsort(far, axis=1, kind="stable")[:, :NEIGHBOURS]
-    columns, there = np.take_along_axis(columns, nearest, 1), np.take_along_axis(there, nearest, 1)
-    away = np.take_along_axis(away, nearest[:, :, None], 1).astype(np.float64)
-    return np.where(there, columns, 0), _weights(away, there)
+    sorted_keys, parts = keys[by_key], []
+    for chunk in (new[at : at + _CHUNK] for at in range(0, len(new), _CHUNK)):
+        cells = (places[chunk] // size)[:, None] + _AROUND
+        wanted = _keys(cells.reshape(-1, 3)).reshape(len(chunk), -1)
+        columns = by_key[np.searchsorted(sorted_keys, wanted).clip(max=len(keys) - 1)]
+        there = keys[columns] == wanted
+        away = places[order[columns]] - places[chunk][:, None]
+        far = np.where(there, (away**2).sum(axis=2), np.int64(1) << 60)
+        # Stable, so that of equally far ones the one in the earlier cell comes first on every machine.
+        nearest = np.argsort(far, axis=1, kind="stable")[:, :NEIGHBOURS]
+        columns, there = np.take_along_axis(columns, nearest, 1), np.take_along_axis(there, nearest, 1)
+        away = np.take_along_axis(away, nearest[:, :, None], 1).astype(np.float64)
+        parts.append((np.where(there, columns, 0), _weights(away, there)))
+    found, numbers = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return found, numbers
 
 
 def _weights(away: NDArray[np.float64], there: NDArray[np.bool_]) -> NDArray[np.int64]:

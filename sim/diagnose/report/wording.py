@@ -312,11 +312,9 @@ def control_sentences(diagnosis: Diagnosis) -> list[str]:
         how = "better" if gap.refitted_rms_m < CLEARLY_BETTER * after else "as well"
         # A cause that corrects a parameter of the nominal model is among what was re-fitted.
         own = set(found_effects(diagnosis.verdict)) & {"friction", "restitution", "stiffness"}
-        those = (
-            f"all of the nominal model's own parameters, {effect_label(sorted(own)[0])} among them,"
-            if own
-            else ("the nominal model's own parameters, without any new effect,")
-        )
+        those = "the nominal model's own parameters, without any new effect,"
+        if own:
+            those = f"all of the nominal model's own parameters, {effect_label(min(own))} among them,"
         said.append(f"Re-fitting {those} does {how} ({_length(gap.refitted_rms_m)}).")
     said += _better_alternatives(diagnosis)
     if gap.numerics_rms_m > max(0.25 * gap.before_rms_m, after):

@@ -103,8 +103,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
 def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float]) -> list[float]:
     """Return the ``scores`` of the objects ``masks`` (h, w), at most ``LEFT_ASIDE`` for what a photo is not of.
 
-    That is what is tiny beside the largest object, and, where another is whole, what the photo's border cuts: nobody
-    sees how it goes on, so it cannot move.
+    Left aside are objects that are tiny beside the largest one, and, where another is whole, those cut by the photo's
+    border: their remainder is unknown, so they cannot be moved.
     """
     areas = [int(mask.sum()) for mask in masks]
     largest = max((area for area, score in zip(areas, scores, strict=True) if score > LEFT_ASIDE), default=0)
