@@ -10,6 +10,8 @@ streaks. What nothing shows is plain matter: the colours of its counterpart on t
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +70,46 @@ PLANES = ((1, 2), (0, 2), (0, 1))
 PLANE_SHARPNESS = 6.0
 
 
+class SurfaceValues(NamedTuple):
+    """What the colour of a place on the body depends on, each (P, k), interpolated over its faces."""
+
+    place: Points
+    """(P, 3)."""
+
+    normal: Points
+    """(P, 3), not of unit length between vertices."""
+
+    counterpart: Points
+    """(P, 2) px of the photo where the visible side is like it."""
+
+    pixel: Points
+    """(P, 2) px of the photo where it is itself."""
+
+    hidden: Points
+    """(P, 1) share of its faces that others hide."""
+
+    flatness: Points
+    """(P, 1) 0 where curved as a ball, 1 on a plane."""
+
+    unlit: Points
+    """(P, 1) share of the counterpart's light that is taken out."""
+
+    blended: Points
+    """(P, 3) sRGB, 0 to 255, across seams between counterparts."""
+
+    seam: Points
+    """(P, 1) share of ``blended``."""
+
+    @classmethod
+    def from_columns(cls, columns: Points) -> SurfaceValues:
+        """Return the values of ``columns`` (P, 17), as ``np.column_stack`` makes them."""
+        return cls(*np.split(columns, np.cumsum(WIDTHS)[:-1], axis=1))
+
+
+WIDTHS = (3, 3, 2, 2, 1, 1, 1, 3, 1)
+"""Columns of each of the ``SurfaceValues``."""
+
+
 def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -> TexturedSurface:
     """Return ``body`` with its texture; vertices along the borders of charts occur once per chart.
 
@@ -97,27 +139,38 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     source = np.concatenate([used, charts.source])
     inside = _cropped(mask, texture)
     matter = plain_matter(texture.pixels, inside)
-    values = np.column_stack([body.vertices, _vertex_normals(body), colours, body.pixels])
-    values = np.column_stack([values, _vertex_share(body, (cosine > 0) & ~shown), _flatness(body, normals)])
     size_px = float(np.sqrt(inside.sum()))
     seen = seen_vertices(camera, body)
     behind = _smoothed(body, distance_behind(body, seen, size_px))
+    flatness = _flatness(body, normals)
     # Beyond an edge, light is another one at once.
-    values = np.column_stack([values, np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), values[:, 11])])
+    unlit = np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), flatness)[:, None]
     light = light_on(camera, body, texture, inside)
-    values = np.column_stack([values, _without_seams(body, seen, values, texture, matter, light, size_px)])
-    values = values[charts.source]
+    blend, seam = _without_seams(body, seen, colours, unlit, texture, matter, light, size_px)
+    hidden = _vertex_share(body, (cosine > 0) & ~shown)
+    of_vertices = SurfaceValues(
+        place=body.vertices,
+        normal=_vertex_normals(body),
+        counterpart=colours,
+        pixel=body.pixels,
+        hidden=hidden[:, None],
+        flatness=flatness[:, None],
+        unlit=unlit,
+        blended=blend,
+        seam=seam[:, None],
+    )
+    of_charts = SurfaceValues(*(np.array(value[charts.source], dtype=np.float64) for value in of_vertices))
     if body.corner_colours is not None:
-        values[charts.faces, 6:8] = body.corner_colours[~photo]
+        of_charts.counterpart[charts.faces] = body.corner_colours[~photo]
     at = np.column_stack([charts.texels, np.ones(len(charts.texels))])
     found = rasterise(at, charts.faces, charts.size, np.ones(len(rest), dtype=bool))
-    texel = found.interpolated(charts.faces, values)
+    texels = SurfaceValues.from_columns(found.interpolated(charts.faces, np.column_stack(of_charts)))
     soft = texture.alpha is not None
     below = np.zeros((charts.size[1], size[0], 4 if soft else 3), dtype=np.uint8)
     if len(found.rows):
-        colour = _colours(camera, texel, texture, inside, matter, light, frame, pixels)
+        colour = _colours(camera, texels, texture, inside, matter, light, frame, pixels)
         if soft:
-            colour = np.column_stack([colour, _cover(camera, texel, texture)])
+            colour = np.column_stack([colour, _cover(camera, texels, texture)])
         below[found.rows, found.columns] = np.clip(colour + 0.5, 0, 255).astype(np.uint8)
         covered = np.zeros(below.shape[:2], dtype=bool)
         covered[found.rows, found.columns] = True
@@ -234,26 +287,24 @@ def _cropped(mask: Mask, texture: CropTexture) -> Mask:
 def _without_seams(
     body: BodyMesh,
     seen: Mask,
-    values: Points,
+    counterpart: Points,
+    unlit: Points,
     texture: CropTexture,
     matter: PlainMatter,
     light: NDArray[np.float32],
     size: float,
-) -> Points:
-    """Colours and their share (V, 4) around seams between counterparts, which a box has at its edges only.
-
-    values: (V, 13) as those of ``_colours``.
-    """
-    like = values[:, 6:8] - (texture.left + 0.5, texture.top + 0.5)
-    plain = _without_light(_sampled(matter.colours, like), values[:, 12:13] * _sampled(light, like))
+) -> tuple[Points, NDArray[np.float64]]:
+    """Colours (V, 3) across seams between counterparts, which a box has at its edges only, and their share (V,)."""
+    like = counterpart - (texture.left + 0.5, texture.top + 0.5)
+    plain = _without_light(_sampled(matter.colours, like), unlit * _sampled(light, like))
     if body.corner_colours is not None:
-        return np.column_stack([plain, np.zeros(len(plain))])
-    return np.column_stack(blended(body, seen, like, plain, size))
+        return plain, np.zeros(len(plain))
+    return blended(body, seen, like, plain, size)
 
 
 def _colours(
     camera: Camera,
-    texel: Points,
+    texels: SurfaceValues,
     texture: CropTexture,
     mask: Mask,
     matter: PlainMatter,
@@ -261,24 +312,23 @@ def _colours(
     frame: Points,
     pixels: float,
 ) -> NDArray[np.float64]:
-    """Colours (P, 3) of texels (P, 17): place, normal, counterpart's pixel, own pixel, share hidden, flatness, share of
-    the counterpart's light that is taken out, colour without seams, share of that.
+    """Colours (P, 3) of ``texels``.
 
     mask: (h, w) the object in ``texture``. light: (h, w, 3) its logarithm. pixels: of the photo per unit of length.
     """
-    normal = texel[:, 3:6] / np.maximum(np.linalg.norm(texel[:, 3:6], axis=1, keepdims=True), 1e-12)
+    normal = texels.normal / np.maximum(np.linalg.norm(texels.normal, axis=1, keepdims=True), 1e-12)
     corner = (texture.left + 0.5, texture.top + 0.5)
-    like, own = texel[:, 6:8] - corner, texel[:, 8:10] - corner
-    grain = _grain(matter, texel[:, :3] @ frame.T * pixels, normal @ frame.T)
+    like, own = texels.counterpart - corner, texels.pixel - corner
+    grain = _grain(matter, texels.place @ frame.T * pixels, normal @ frame.T)
     grain *= _sampled(matter.contrast[..., None], like)
-    plain = _without_light(_sampled(matter.colours, like), texel[:, 12:13] * _sampled(light, like))
-    plain += texel[:, 16:17] * (texel[:, 13:16] - plain) + grain
-    towards = camera.position - texel[:, :3]
+    plain = _without_light(_sampled(matter.colours, like), texels.unlit * _sampled(light, like))
+    plain += texels.seam * (texels.blended - plain) + grain
+    towards = camera.position - texels.place
     cosine = (normal * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)
     depth = ndimage.distance_transform_edt(mask).astype(np.float32)[..., None]
     away = _sampled(depth, own)[:, 0]
-    clear = smoothstep(away, *CLEAR) * (cosine > SHOWN[0]) * texel[:, 11]
-    weight = (np.maximum(smoothstep(cosine, *SHOWN), clear) * (1.0 - texel[:, 10]))[:, None]
+    clear = smoothstep(away, *CLEAR) * (cosine > SHOWN[0]) * texels.flatness[:, 0]
+    weight = np.maximum(smoothstep(cosine, *SHOWN), clear)[:, None] * (1.0 - texels.hidden)
     seen = np.flatnonzero(weight[:, 0] > 0)
     if not len(seen):
         return plain
@@ -300,12 +350,12 @@ def _colours(
     return plain
 
 
-def _cover(camera: Camera, texel: Points, texture: CropTexture) -> NDArray[np.float64]:
-    """Alpha (P,), 0 to 255, of texels (P, 17; see ``_colours``): the photo's where they face its camera, else full."""
+def _cover(camera: Camera, texels: SurfaceValues, texture: CropTexture) -> NDArray[np.float64]:
+    """Alpha (P,), 0 to 255, of ``texels``: the photo's where they face its camera, else full."""
     assert texture.alpha is not None
-    own = texel[:, 8:10] - (texture.left + 0.5, texture.top + 0.5)
-    towards = ((camera.position - texel[:, :3]) * texel[:, 3:6]).sum(axis=1) > 0
-    shown = towards * (1.0 - texel[:, 10])
+    own = texels.pixel - (texture.left + 0.5, texture.top + 0.5)
+    towards = ((camera.position - texels.place) * texels.normal).sum(axis=1) > 0
+    shown = towards * (1.0 - texels.hidden[:, 0])
     return 255.0 - shown * (255.0 - _sampled(texture.alpha[..., None].astype(np.float32), own)[:, 0])
 
 
