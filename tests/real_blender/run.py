@@ -5,7 +5,8 @@
 
 Needs the standard library only, so that it also runs where nothing but Blender is installed. Without a display it
 starts Xvfb. docs/blender.md says how to set up a container for it. Everything is written below DIR: ``report.json``,
-logs, ``screens/*.png``, the .blend and the two pictures of the same frame. Exit code 0 when all steps passed.
+logs, a folder of pictures for each script, the .blend and the two pictures of the same frame. Exit code 0 when all
+steps passed.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def main() -> int:
     (options.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     for step in run.steps:
         sys.stdout.write(f"{json.dumps(step)}\n")
-    sys.stdout.write(f"{trouble or 'all steps passed'}; screenshots in {options.out / 'screens'}\n")
+    sys.stdout.write(f"{trouble or 'all steps passed'}; pictures below {options.out}\n")
     return 1 if trouble else 0
 
 
