@@ -65,9 +65,11 @@ def composition_bytes(cells: int, splats: int, vertices: int, pixels: int) -> in
 
 RENDERING_BASE = 482 * MIB
 RENDERING_PIXEL = 441
+"""Of frames that objects fill; where they are small, less is rendered, and two thirds of it were taken."""
 RENDERING_VERTEX = 1250
-RENDERING_TEXEL = 58
-"""Of a pixel of the objects' textures: decoded, as Blender's, and as Cycles' own."""
+RENDERING_TEXEL = 32
+"""Of a pixel of the objects' textures while the scene is built, before there are frames: decoded, written, and read by
+Blender. Of 16 million in one texture or four, and of 4 million in one; of more, or in smaller ones, 20 to 25."""
 RENDERING_RESERVED = 2300 * MIB
 
 
@@ -76,7 +78,8 @@ def rendering_bytes(pixels: int, vertices: int, texels: int = 0) -> int:
 
     vertices: of all objects and particles shown; texels: pixels of all textures.
     """
-    return RENDERING_BASE + RENDERING_PIXEL * pixels + RENDERING_VERTEX * vertices + RENDERING_TEXEL * texels
+    most = max(RENDERING_PIXEL * pixels, RENDERING_TEXEL * texels)
+    return RENDERING_BASE + RENDERING_VERTEX * vertices + most
 
 
 def require_memory(needed: int, available: int | None, *, what: str, remedy: str) -> None:

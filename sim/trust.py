@@ -224,14 +224,17 @@ def remember(key: str, source: Path) -> None:
 
 MOST_CODE_FILES = 2000
 MOST_CODE_BYTES = 64 * 2**20
+MOST_LOOKED_AT = 100_000
+"""Files and folders."""
 _CODE = (".py", ".pyc", ".pyd", ".so", ".dll", ".dylib", ".sh", ".bat", ".cmd", ".exe", ".toml", ".pth", ".jar", ".js")
 UNKNOWN = "asked every time, as there is too much code beside it to remember"
 
 
 def code_hash(places: Sequence[Path]) -> str:
-    """Return a hash over the code at ``places``: each a file, or a folder with all code in it, links not followed.
+    """Return a hash over the code at ``places``: each a file, or a folder with all code in it.
 
-    Beyond ``MOST_CODE_FILES`` or ``MOST_CODE_BYTES`` it is a new one at every call, so that nothing is remembered.
+    Links are followed, as imports follow them. Beyond ``MOST_CODE_FILES``, ``MOST_CODE_BYTES`` or ``MOST_LOOKED_AT`` it
+    is a new one at every call, so that nothing is remembered.
     """
     whole, left = hashlib.sha256(), MOST_CODE_BYTES
     count = 0
@@ -240,7 +243,7 @@ def code_hash(places: Sequence[Path]) -> str:
             count += 1
             try:
                 left -= path.stat().st_size
-                if count > MOST_CODE_FILES or left < 0:
+                if count > MOST_CODE_FILES or left < 0 or path.is_dir():  # a folder: too much is in it
                     return f"{UNKNOWN} {secrets.token_hex(16)}"
                 whole.update(f"{path}\0".encode(errors="surrogateescape") + hashlib.sha256(path.read_bytes()).digest())
             except OSError:
@@ -249,13 +252,26 @@ def code_hash(places: Sequence[Path]) -> str:
 
 
 def _code_files(place: Path) -> Iterator[Path]:
+    """Yield the files at ``place`` that may be run or imported; the folder where they are too many to look at."""
     if place.is_file():
         yield place
         return
-    for root, folders, names in os.walk(place):
+    seen: set[str] = set()
+    looked = 0
+    for root, folders, names in os.walk(place, followlinks=True):
+        looked += len(folders) + len(names)
+        if looked > MOST_LOOKED_AT:
+            yield Path(root)
+            return
+        real = os.path.realpath(root)
+        if real in seen:
+            # Links in a circle, or two to one folder.
+            folders[:] = []
+            continue
+        seen.add(real)
         folders[:] = sorted(name for name in folders if name != "__pycache__")
         for name in sorted(names):
             path = Path(root) / name
             runs = name.lower().endswith(_CODE) or (os.name != "nt" and os.access(path, os.X_OK))
-            if runs and not path.is_symlink() and path.is_file():
+            if runs and path.is_file():
                 yield path

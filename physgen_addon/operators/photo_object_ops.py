@@ -16,6 +16,7 @@ from ...sim.app.propose import best_proposals
 from ...sim.app.stage_process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
+from ...sim.picture_header import require_picture
 from ...sim.reconstruct.reconstruct_options import Proposal
 from ..background_jobs import JobOperator, Work
 from ..context import TAB, redraw, show_beside
@@ -145,6 +146,7 @@ def _shrunk(mask: NDArray[np.bool_], times: int) -> NDArray[np.bool_]:
 
 def _pixels(path: Path) -> NDArray[np.float32]:
     """Return the values of a picture as stored, 0 to 1, (H, W, 4), first row at the bottom."""
+    require_picture(path)
     try:
         image = bpy.data.images.load(str(path))
     except RuntimeError as error:

@@ -19,6 +19,7 @@ import bpy
 
 from ...sim.errors import InputError
 from ...sim.files import MOST_HASHED, open_file
+from ...sim.picture_header import require_picture
 
 LAYERS, LOOK, TREE = "PhysGen Layers", "PhysGen Look", "PhysGen Compositing"
 OURS = "physgen_look"
@@ -108,6 +109,8 @@ def _names(head: bytes) -> dict[str, int]:
 
 
 def _sequence(frames: list[Path]) -> bpy.types.Image:
+    for path in frames:
+        require_picture(path)
     image = bpy.data.images.load(str(frames[0]), check_existing=True)
     image.source = "SEQUENCE"
     image.reload()

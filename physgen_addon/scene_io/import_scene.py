@@ -15,6 +15,7 @@ from ...sim.effects.registry import effect
 from ...sim.errors import InputError
 from ...sim.gaussians.splat_ply import read_splats
 from ...sim.gaussians.splats import Splats, transform_splats
+from ...sim.picture_header import require_picture_bytes
 from ...sim.scene.folder import SCENE_FILE, Scene, load_scene
 from ...sim.scene.model import Ground, SceneObject
 from ...sim.scene.textured_mesh import TexturedMesh, read_textured_mesh
@@ -83,6 +84,7 @@ def _appearance(
     ``meshes/NAME.glb``, in the same layout; without one, the texture itself.
     """
     if mesh.uv is not None and mesh.picture is not None:
+        require_picture_bytes(mesh.picture, f"object {source.name}: the picture in {source.mesh}")
         image = made.add(bpy.data.images.new(source.name, 1, 1))
         image.pack(data=mesh.picture, data_len=len(mesh.picture))
         image.source = "FILE"

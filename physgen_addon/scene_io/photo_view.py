@@ -16,6 +16,7 @@ from mathutils import Matrix, Quaternion, Vector
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.picture_header import require_picture
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene
 from ...sim.scene.model import Camera, Light
@@ -145,9 +146,10 @@ class View:
 
 
 def load_picture(made: Made, path: Path) -> bpy.types.Image:
-    """Return the image at ``path``, packed, so that the .blend needs no file beside it. Raises InputError if
-    unreadable.
+    """Return the image at ``path``, packed, so that the .blend needs no file beside it. Raises InputError if it is
+    unreadable, or claims more pixels than a picture has: Blender would take the memory before it says so.
     """
+    require_picture(path)
     try:
         image = made.add(bpy.data.images.load(str(path), check_existing=False))
     except RuntimeError:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -186,11 +187,7 @@ def require_request(scene: Scene, agreed: Agreed | None = None, replaced: Replac
 def _claims(file: _File, root: Path) -> Iterator[Claim]:
     """Yield all that the record asks for beyond the folder ``root``: every path and every adapter in it."""
     for where, path in _paths(file):
-        try:
-            within = path.resolve().is_relative_to(root.resolve())
-        except (OSError, ValueError, RuntimeError):
-            within = False
-        if not within:
+        if not _within(path, root):
             yield Claim(READS, where, str(path))
     for stage in STAGES:
         spec = getattr(file.options, stage)
@@ -199,6 +196,22 @@ def _claims(file: _File, root: Path) -> Iterator[Claim]:
             claim = spec_claim(stage, text, f"options.{stage}")
             if claim is not None:
                 yield claim
+
+
+def _within(path: Path, root: Path) -> bool:
+    """Return whether ``path`` is in the folder ``root``, links followed.
+
+    Nothing outside is touched to find out: on Windows a look at another computer's folder tells it who looks.
+    """
+    try:
+        home = root.resolve()
+        named = Path(os.path.normpath(path.absolute()))
+        if not (named.is_relative_to(home) or named.is_relative_to(root.absolute())):
+            return False
+        # A link may lead out.
+        return path.resolve().is_relative_to(home)
+    except (OSError, ValueError, RuntimeError):
+        return False
 
 
 def _paths(file: _File) -> Iterator[tuple[str, Path]]:

@@ -186,11 +186,12 @@ def table(rows: Iterator[list[object]]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text)
     for row in rows:
-        writer.writerow(["" if cell is None else _harmless(cell) for cell in row])
+        writer.writerow(["" if cell is None else no_formula(cell) for cell in row])
     return text.getvalue().encode()
 
 
-def _harmless(cell: object) -> object:
+def no_formula(cell: object) -> object:
+    """Return ``cell`` of a table, a text that a spreadsheet would take for a formula with an apostrophe before it."""
     return f"'{cell}" if isinstance(cell, str) and cell[:1] in ("=", "+", "-", "@", "\t", "\r") else cell
 
 

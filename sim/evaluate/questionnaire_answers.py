@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..files import shown, without_folder
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
+from .evaluation import no_formula
 from .model_judge import CRITERIA, TITLES
 from .questionnaire import ANSWERS_FORMAT, load_key
 from .questionnaire_report import PAGE_FILE, result_page
@@ -329,8 +330,7 @@ def _csv(sheets: list[Sheet], cases: list[dict[str, Any]]) -> bytes:
         for case in cases:
             for token, video in case["videos"].items():
                 for criterion in CRITERIA:
-                    # A person's code may begin with "-", which spreadsheets would compute.
-                    person = f"'{sheet.person}" if sheet.person.startswith("-") else sheet.person
                     score = sheet.scores[case["id"]][token].get(criterion, "")
-                    writer.writerow([person, case["name"], video, criterion, score])
+                    row = [sheet.person, case["name"], video, criterion, score]
+                    writer.writerow([no_formula(cell) for cell in row])
     return text.getvalue().encode()

@@ -301,6 +301,13 @@ def damage_texture(folder):
     path.write_bytes(content[: start + 4] + bytes(60) + content[start + 64 :])
 
 
+def claim(path, side=60_000):
+    """Let the PNG in the file ``path`` say that it is of ``side`` pixels a side: Blender would take 14 GB for it."""
+    content = path.read_bytes()
+    start = content.index(b"IHDR") + 4
+    path.write_bytes(content[:start] + 2 * side.to_bytes(4, "big") + content[start + 8 :])
+
+
 def newer(folder):
     path = folder.root / "scene.json"
     path.write_text(path.read_text().replace("physgen-scene/1", "physgen-scene/9"))
@@ -312,6 +319,15 @@ DAMAGES = {
     "photo": (
         lambda folder: folder.file("photo.png").write_bytes(b"no picture"),
         "photo.png: is not a readable picture",
+    ),
+    "photo of 3,600 million pixels": (
+        lambda folder: claim(folder.file("photo.png")),
+        "photo.png: claims 60000x60000 pixels",
+    ),
+    "background of as many": (lambda folder: claim(folder.file("background.png")), "claims 60000x60000 pixels"),
+    "texture of as many": (
+        lambda folder: claim(folder.file(folder.model.objects[0].mesh)),
+        r"the picture in meshes/ball\.glb: claims 60000x60000 pixels",
     ),
     "missing": (lambda folder: folder.file("background.png").unlink(), "background.png"),
     "newer": (newer, "update PhysGen"),
@@ -418,7 +434,14 @@ def test_boxes_become_the_commands_arguments(world, tmp_path):
 
 
 def test_other_files_than_photos_are_refused(tmp_path):
-    for name, content, words in (("a.png", b"nothing", "not a readable"), ("a.txt", b"x", "is no photo")):
+    Image.new("RGB", (8, 8)).save(tmp_path / "large.png")
+    claim(tmp_path / "large.png")
+    large = (tmp_path / "large.png").read_bytes()
+    for name, content, words in (
+        ("a.png", b"nothing", "not a readable"),
+        ("large.png", large, "claims 60000x60000"),
+        ("a.txt", b"x", "is no photo"),
+    ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(RuntimeError, match=words):
             bpy.ops.physgen.open_photo(filepath=str(tmp_path / name))

@@ -17,11 +17,14 @@ from physgen.sim.importers.coco_masks import masks_from_json
 from physgen.sim.importers.image_masks import masks_from_array_file, masks_from_image
 from physgen.sim.importers.physgen import read_physgen
 from physgen.sim.importers.physgen3d import read_physgen3d
+from physgen.sim.picture_header import require_picture
 from physgen.sim.reconstruct.camera.depth_map import read_depth
 from physgen.sim.reconstruct.photo import load_photo
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 from physgen.sim.scene.environment import read_environment
 from PIL import Image
+
+PICTURES = (".png", ".jpg", ".webp", ".tif", ".bmp", ".exr", ".hdr")
 
 
 def _environment(path: Path) -> None:
@@ -96,6 +99,12 @@ add(
     "m.npz",
     lambda f: np.savez_compressed(f / "m.npz", masks=MASK[None] > 0),
     lambda f: masks_from_array_file(f / "m.npz"),
+)
+add(
+    "header of a picture",
+    ("p.png", "p.jpg", "p.webp", "p.tif", "p.bmp", "p.exr", "p.hdr"),
+    lambda f: [_environment(f / f"p{s}") if s in (".exr", ".hdr") else put_picture(f / f"p{s}") for s in PICTURES],
+    lambda f: [require_picture(f / f"p{s}", folder=f) for s in PICTURES],
 )
 add("masks COCO", "coco.json", _coco, lambda f: masks_from_json(f / "coco.json", 64, 48, "photo.png"))
 for _suffix in (".exr", ".hdr"):

@@ -244,6 +244,61 @@ def test_no_code_beside_what_is_hashed_is_missed(tmp_path):
     assert trust.code_hash([tmp_path]) != trust.code_hash([tmp_path])
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
+def test_code_behind_a_link_counts_as_code(tmp_path):
+    """What is imported through a link could be changed after the user's word, and ran without another."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "data.bin").write_text("a")
+    (tmp_path / "elsewhere" / "deep.py").write_text("a")
+    (tmp_path / "code" / "x.py").symlink_to(tmp_path / "data.bin")
+    (tmp_path / "code" / "package").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "around").symlink_to(tmp_path / "code")
+    found = [trust.code_hash([tmp_path / "code"])]
+    assert found[0] == trust.code_hash([tmp_path / "code"])
+    for path in (tmp_path / "data.bin", tmp_path / "elsewhere" / "deep.py"):
+        path.write_text("b")
+        found.append(trust.code_hash([tmp_path / "code"]))
+    assert len(set(found)) == 3
+
+
+def test_too_much_to_look_at_is_asked_about_every_time(tmp_path, monkeypatch):
+    (tmp_path / "x.py").write_text("a")
+    monkeypatch.setattr(trust, "MOST_LOOKED_AT", 4)
+    assert trust.code_hash([tmp_path]) == trust.code_hash([tmp_path])
+    for number in range(5):
+        (tmp_path / f"{number}.txt").touch()
+    assert trust.code_hash([tmp_path]) != trust.code_hash([tmp_path])
+
+
+def test_nothing_outside_is_looked_at_before_the_users_word(scene, tmp_path):
+    """On Windows a look at \\\\host\\share tells the host who looks; nor is a folder of the network mounted."""
+    looked = []
+
+    def hear(event, given):
+        if watching and event in ("open", "os.listdir", "os.scandir"):
+            looked.append(os.fsdecode(given[0]) if isinstance(given[0], str | bytes) else "")
+
+    private = tmp_path / "private" / "photo.png"
+    change(scene, lambda record: record.update(photo=str(private)))
+    stamp = read_stamp(scene)
+    lstat = os.lstat
+
+    def noted(path, **more):
+        looked.append(os.fsdecode(path))
+        return lstat(path, **more)
+
+    watching = True
+    sys.addaudithook(hear)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "lstat", noted)
+        patch.setattr(os.path, "lexists", lambda path: bool(noted(path)))
+        claims = stamp.request.claims()
+    watching = False
+    assert [claim.text for claim in claims] == [str(private)]
+    assert looked and not [path for path in looked if "private" in path]
+
+
 def test_the_error_names_the_remedy(scene):
     change(scene, lambda record: record["options"].update(mesher="python:os:system"))
     with pytest.raises(InputError, match=r"you have not agreed to it:\n  runs  options\.mesher = python:os:system"):
