@@ -211,7 +211,15 @@ class PreparedWorld:
     def on(self, arch: str) -> PreparedWorld:
         """Return the same, with the cost on another architecture."""
         bodies, step = len(self.setup.bodies), self.stable_step
-        cost = estimate(self.particle_count, bodies, step, self.duration, arch, file_bytes=self.file_bytes)
+        cost = estimate(
+            self.particle_count,
+            bodies,
+            step,
+            self.duration,
+            arch,
+            file_bytes=self.file_bytes,
+            largest=_largest(self.setup),
+        )
         return dataclasses.replace(self, arch=arch, cost=cost)
 
 
@@ -275,7 +283,9 @@ def prepare_world(
         body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
         collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
         warnings=tuple(warnings),
-        cost=estimate(count, len(setup.bodies), step, duration, options.arch, file_bytes=files),
+        cost=estimate(
+            count, len(setup.bodies), step, duration, options.arch, file_bytes=files, largest=_largest(setup)
+        ),
         stable_step=step,
         duration=duration,
         arch=options.arch,
@@ -293,6 +303,11 @@ def _file_bytes(folder: Scene, item: SceneObject) -> int:
 def _soft_count(setup: WorldSetup) -> int:
     """Particles that the engine moves; those of rigid bodies only tell their mass and carry their mesh."""
     return sum(body.count for body in setup.bodies if not body.rigid)
+
+
+def _largest(setup: WorldSetup) -> int:
+    """Particles of the largest body; a rigid one's mesh is filled, too."""
+    return max((body.count for body in setup.bodies), default=0)
 
 
 def _granular(scene: SceneModel) -> set[str]:

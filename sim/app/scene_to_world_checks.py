@@ -24,7 +24,7 @@ from ..errors import InputError
 from ..memory import available_memory, require_memory
 from ..mpm.bodies import THIN_CELLS, BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
-from ..mpm.cost_estimate import SAMPLING_BYTES
+from ..mpm.cost_estimate import sampling_bytes
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES
 from ..mpm.geometry.mesh_checks import check_surface, thickness_of
 from ..mpm.geometry.signed_distance import DistanceLattice, overlap, signed_distance
@@ -105,7 +105,7 @@ def _refuse_absurd(names: Sequence[str], meshes: Sequence[ObjectMesh], quality: 
             f"({lengths[large]:.2g} m); choose a coarser quality, make one of them a collider, or check their sizes"
         )
     require_memory(
-        int(count * SAMPLING_BYTES),
+        sampling_bytes(count, max(each)),
         available_memory(),
         what=f"{int(count)} particles",
         remedy="choose a coarser quality, make more objects colliders",

@@ -35,7 +35,11 @@ PARTICLE_BYTES = 400
 
 SAMPLING_BYTES = 2500
 """Of main memory, a particle, while a mesh is filled: 27 test points each, and their nearest particles. Measured: 2300
-to 2500 from 30 to 500 thousand particles. Given back before the engine starts, so the larger of the two counts."""
+to 2500 from 30 to 500 thousand particles. Given back before the next mesh is filled and the engine starts, so the
+largest of them counts."""
+
+SAMPLED_BYTES = 100
+"""Of a particle of a mesh that is filled: place, volume, and what tells where it lies. Chosen."""
 
 BLOCK_BYTES = 64 * 64
 """A grid block of 4 x 4 x 4 nodes with 64 bytes each."""
@@ -74,11 +78,19 @@ class Estimate:
 
 
 def estimate(
-    particles: int, bodies: int, stable_step: float, duration: float, arch: str, *, file_bytes: int = 0
+    particles: int,
+    bodies: int,
+    stable_step: float,
+    duration: float,
+    arch: str,
+    *,
+    file_bytes: int = 0,
+    largest: int | None = None,
 ) -> Estimate:
     """The cost of simulating ``duration`` seconds of ``particles`` in ``bodies`` with substeps of ``stable_step`` s.
 
-    arch: as in ``SolverOptions``; file_bytes: of the largest mesh file.
+    arch: as in ``SolverOptions``; file_bytes: of the largest mesh file; largest: particles of the largest body,
+    None: all.
     """
     if not (math.isfinite(stable_step) and stable_step > 0):
         raise InputError(
@@ -89,13 +101,19 @@ def estimate(
     rate = GPU_RATES.get(arch, CPU_RATE * _cores())
     blocks = math.ceil(particles / BLOCK_PARTICLES) + BODY_BLOCKS * bodies
     held = particles * PARTICLE_BYTES + blocks * BLOCK_BYTES
+    filling = sampling_bytes(particles, particles if largest is None else largest)
     reading = FILE_COPIES * file_bytes + STARTING_BYTES - BASE_BYTES
     return Estimate(
         substeps=substeps,
         particle_substeps=work,
         seconds=START_SECONDS + substeps * SUBSTEP_SECONDS + work / rate,
-        bytes=BASE_BYTES + (held if arch in GPU_RATES else max(held, particles * SAMPLING_BYTES, reading)),
+        bytes=BASE_BYTES + (held if arch in GPU_RATES else max(held, filling, reading)),
     )
+
+
+def sampling_bytes(particles: float, largest: float) -> int:
+    """Return the bytes of main memory that filling meshes with ``particles`` takes, ``largest`` of them in one mesh."""
+    return int(largest * SAMPLING_BYTES + max(0.0, particles - largest) * SAMPLED_BYTES)
 
 
 def stable_step(bodies: Sequence[BodyParticles], cell: float, options: SolverOptions) -> float:

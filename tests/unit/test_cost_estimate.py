@@ -40,6 +40,9 @@ def test_cost_grows_with_particles_duration_and_substeps(monkeypatch):
     assert (cost.substeps, cost.particle_substeps) == (20_000, 2e10)
     assert cost.seconds == pytest.approx(2e10 / 5e6, rel=0.01)
     assert cost.bytes > 400e6 and estimate(0, 1, 1e-4, 2.0, "cuda").bytes < 300 * 2**20
+    # Meshes are filled one after the other: of two with 102,016 particles each a bake took 459 MiB.
+    one, two = (estimate(204_032, 2, 1e-4, 2.0, "cpu", largest=n).bytes / 2**20 for n in (204_032, 102_016))
+    assert one > 700 and two == pytest.approx(459, rel=0.15)
     with pytest.raises(InputError, match=r"time step.*velocity"):
         estimate(10, 1, 0.0, 1.0, "cpu")
 
