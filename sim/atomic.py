@@ -33,6 +33,7 @@ WINDOWS_PAUSES = (0.01, 0.05, 0.2, 0.5)
 _PATIENT = os.name == "nt"
 
 _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK})(?P<suffix>(?:\.[^/]*)?)", re.DOTALL)
+_LOCK_OF_TEMPORARY = re.compile(rf"\.(?P<of>\..+\.(?:partial|old)-{MARK})\.lock", re.DOTALL)
 _SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
 
 LONGEST_NAME = 255
@@ -220,7 +221,8 @@ def recover(path: Path) -> list[str]:
 
 def _put_back_or_removed(left: Path) -> str:
     found = _TEMPORARY.fullmatch(left.name)
-    if found is not None and found["role"] == "old" and found["name"] not in (".", ".."):
+    is_lock = _LOCK_OF_TEMPORARY.fullmatch(left.name) is not None
+    if found is not None and found["role"] == "old" and found["name"] not in (".", "..") and not is_lock:
         path = left.with_name(found["name"])
         if not path.exists():
             with contextlib.suppress(OSError):
@@ -314,7 +316,9 @@ def _dead_beside(path: Path) -> Iterator[Path]:
 
 
 def _names(name: str) -> Iterator[str]:
-    """Yield what a temporary ``name`` is of: a temporary name may be of another one."""
+    """Yield what a temporary ``name`` is of: a temporary name may be of another one, and a lock beside one."""
+    if lock := _LOCK_OF_TEMPORARY.fullmatch(name):
+        yield from _names(lock["of"])
     while found := _TEMPORARY.fullmatch(name):
         yield found["name"]
         yield found["name"] + found["suffix"]

@@ -120,8 +120,14 @@ def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(
         tmp_path / f".scene.partial-{dead}" / "meshes",
         tmp_path / f"..scene.partial-{dead}.partial-{dead}" / "meshes",
         tmp_path / f".scene.old-{dead}" / "meshes",
+        # Locks of folders that were being written, which their scenes are saved under.
+        tmp_path / f"..scene.partial-{dead}.lock",
+        tmp_path / f"..scene.old-{dead}.lock",
+        tmp_path / f"...scene.partial-{dead}.partial-{dead}.lock",
     ]
     kept = [
+        tmp_path / f"..scene.partial-{living}.lock",
+        tmp_path / f"..scene2.partial-{dead}.lock",
         root / f".scene.partial-{living}.json",
         root / f".scene.partial-{other}.json",
         root / f".scene.partial-{dead.pid}.json",
