@@ -411,3 +411,26 @@ def test_pale_dial_that_the_rows_beside_do_not_show_is_no_hole():
     pierced[dial] = (150, 150, 150)
     assert (fill_holes(photo, ring & ~dial) == ring).all()
     assert not fill_holes(pierced, ring & ~dial)[dial].any()
+
+
+def toy_before_a_dark_wall(dark, end, seed=0, height=240, width=320):
+    """A toy of nearly the floor's hue before a dark wall, and its left side up to ``end``, in its own shade ``dark``
+    (linear light)."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    hue = np.array([1.0, 0.72, 0.45])
+    picture = np.where((rows < 150)[..., None], 0.02 * hue, 0.3 * hue * rng.uniform(0.8, 1.2, (height, width, 1)))
+    toy = (columns - 155) ** 2 + (rows - 118) ** 2 < 58**2
+    side = toy & (columns < end)
+    picture = np.where(toy[..., None], 0.5 * hue * np.array([1.0, 1.1, 1.2]), picture)
+    picture = np.where(side[..., None], dark * hue, picture)
+    noisy = np.clip(picture, 0.0, 1.0) ** (1.0 / 2.2) + rng.normal(0.0, 0.01, (height, width, 3))
+    soft = cv2.GaussianBlur(np.clip(noisy, 0.0, 1.0), (0, 0), 0.7)
+    return np.round(255.0 * soft).astype(np.uint8), toy, side
+
+
+@pytest.mark.parametrize(("dark", "end"), [(0.06, 125), (0.1, 125), (0.15, 140)])
+def test_a_toys_shaded_side_before_a_dark_wall_is_no_shadow(dark, end):
+    pixels, toy, side = toy_before_a_dark_wall(dark, end)
+    view = crop_around_box(pixels, (94, 56, 216, 180), np.zeros_like(toy))
+    assert without_ground(view, toy)[side].mean() > 0.97

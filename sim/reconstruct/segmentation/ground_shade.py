@@ -65,6 +65,11 @@ ROUGHER, SMOOTH, DARK_SHARE = 3.5, 0.03, 0.1
 """Fine texture, in natural logarithms of light, over the ground's above which a part is none in shade: shade keeps the
 ratios of lights, so it keeps texture. 1.8 to 2.2 was measured in shadows of two photos, 6 on granite before ice, 20 on
 a toy's wheels. Least texture of a ground; and the share of ``DARK_NOISE`` that is texture of what is nearly black."""
+BESIDE = 2.0
+"""Standard deviation in pixels over which the light on both sides of an outline is averaged."""
+BRIGHTER, MOST_BRIGHTER = 0.25, 0.15
+"""Natural logarithm of a part's light over that beside it outside of the mask, above which no shade ends there; and the
+share of its rim there above which it is none."""
 SHADED, DEEP = -0.15, -0.4
 """Natural logarithm of a pixel's light over the lit ground's below which ground is in shade; and for the median of a
 part: fainter shadows do not deceive a cut, but a bear of the floor's brown does."""
@@ -247,6 +252,21 @@ def _pieces(own: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     return np.asarray(labels, dtype=np.int32), areas
 
 
+def _brighter_than_beyond(light: Light, part: Mask, mask: Mask, free: Mask, outer: Mask) -> Light:
+    """Return how much brighter (n,) ``part`` is at pixels of its ``outer`` rim than what lies beyond, outside of
+    ``mask`` and ``free`` of others, all (h, w), by the natural logarithm ``light``; only where both are seen. Pixels of
+    mixed colours along the outline do not count."""
+    kernel = np.ones((3, 3), np.uint8)
+    sides = part & (cv2.erode(mask.astype(np.uint8), kernel) > 0), free & ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    means, seen = [], outer
+    for side in sides:
+        weight = side.astype(np.float32)
+        total = cv2.GaussianBlur(weight, (0, 0), BESIDE)
+        means.append(cv2.GaussianBlur(light * weight, (0, 0), BESIDE) / np.maximum(total, 1e-6))
+        seen = seen & (total > 0.02)
+    return np.asarray((means[0] - means[1])[seen], dtype=np.float32)
+
+
 def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple[Light, Light]) -> Mask:
     """Those of ``parts`` (h, w) that are like ground and no rougher, border on ground outside of ``mask``, strand
     nothing of the object ``own``, and that an edge parts from it, no weaker than their edge with the ground. judged:
@@ -257,6 +277,7 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
     count, labels, stats, _ = cv2.connectedComponentsWithStats(parts.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
     pieces, rougher = _pieces(own), _rougher(view, mask, parts, np.asarray(labels, dtype=np.int32))
+    light = _log_light(view.pixels).mean(axis=2)
     for index in range(1, count):
         if stats[index, cv2.CC_STAT_AREA] < SPECK or index in rougher:
             continue
@@ -277,6 +298,10 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
         else:
             # The object encloses it: a gap, unless it is filled again as a print.
             parted = on_edges > GAP_RIM and bool(np.median(unlike[part]) < 0.5 * MIDDLE)
+        if parted:
+            # Shade ends where lit ground begins, or goes on as it is.
+            step = _brighter_than_beyond(light, part, mask, ~view.others, outer)
+            parted = len(step) < SPECK or bool((step > BRIGHTER).mean() < MOST_BRIGHTER)
         if parted:
             result |= part
     return result
