@@ -18,6 +18,7 @@ from ..cache.folder_lock import lock_beside
 from ..composite.srgb import read_mask, read_rgb
 from ..errors import InputError
 from ..events import OnEvent, ignore
+from ..reconstruct.background.unboxed_things import unboxed_things
 from ..reconstruct.lighting.light_estimate import LitScene, describe_sun, estimate_light, light_with_sun
 from ..reconstruct.shape.inflate import inflate
 from ..reconstruct.shape.inflated_mesh import shadow_mesh
@@ -140,7 +141,10 @@ def _estimated(
                 f"{folder.root}: its {name} is {picture.shape[1]}x{picture.shape[0]} pixels, its camera's picture "
                 f"{size[1]}x{size[0]}; reconstruct the scene again"
             )
-    lit = LitScene(camera=scene.camera, ground=ground, pixels=pixels, background=behind, masks=masks, meshes=meshes)
+    things = unboxed_things(pixels, masks, scene.camera).whole if bare else None
+    lit = LitScene(
+        camera=scene.camera, ground=ground, pixels=pixels, background=behind, masks=masks, meshes=meshes, things=things
+    )
     return estimate_light(lit, given, notice, with_sun=request.sun)
 
 

@@ -45,6 +45,8 @@ BASE = 0.25
 BURNT = (0.75, 0.95)
 """Brightness of a texel's strongest channel from which it may have clipped, and from which it has: then it is what the
 body's colour and the second channel say."""
+SECOND = 0.1
+"""Share of the body's strongest channel that its second one must have to tell it: a pure red has next to none."""
 BLANK = (0.5, 0.75)
 """Share of a texel's light that its highlight takes from which little is known of what is below, and from which
 nothing: then it is what lies around."""
@@ -96,8 +98,9 @@ class Highlights:
             taken = np.minimum(np.maximum(white - self.base, 0.0) * share, (1.0 - LEFT) * light.min(axis=2))
             rest = light - taken[..., None]
             burnt = (share * smoothstep(light.max(axis=2), *BURNT))[..., None]
-            whole = np.maximum(rest[..., second, None] / self.colour[second] * self.colour, rest)
-            rest += burnt * (whole - rest)
+            if self.colour[second] > SECOND * float(self.colour.max()):
+                whole = np.maximum(rest[..., second, None] / self.colour[second] * self.colour, rest)
+                rest += burnt * (whole - rest)
             blank[first : first + ROWS] = smoothstep(taken / np.maximum(light.mean(axis=2), np.float32(1e-4)), *BLANK)
             result[first : first + ROWS] = linear_to_bytes(rest / HEADROOM)
         if not blank.any():

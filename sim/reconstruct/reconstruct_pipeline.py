@@ -384,6 +384,7 @@ def _light(
         background=layers.background,
         masks=layers.seen,
         meshes=shadow_casters(view, layers.full, bodies),
+        things=layers.unboxed,
     )
     given = None
     if options.environment is not None:

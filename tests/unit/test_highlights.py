@@ -106,3 +106,17 @@ def test_a_pale_body_on_a_coloured_floor_has_none():
     floor = np.array([0.5, 0.3, 0.16]) * (0.8 - 0.3 * normals[..., 1:2])
     picture = linear_to_bytes((floor + 0.5 * above * np.array([0.95, 0.97, 1.0])).astype(np.float32))
     assert find_highlights(bytes_to_linear(picture)[inside], normals[inside]) is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pure_red_stays_red_below_its_highlight():
+    normals, inside = ball()
+    body = np.array([0.9, 0.0, 0.0]) * (0.8 + 0.4 * normals[..., 1:2])
+    picture = linear_to_bytes((body + highlight(normals)).astype(np.float32))
+    found = find_highlights(bytes_to_linear(picture)[inside], normals[inside])
+    assert found is not None
+    left = HEADROOM * bytes_to_linear(found.taken_out(picture))
+    # Where red had clipped, the highlight is taken from what is left of it.
+    assert left[inside][:, 0].min() > 0.7 * body[inside][:, 0].min()
+    assert (left[inside][:, 0] / np.minimum(body[inside][:, 0], 1.0)).min() > 0.7
+    assert left[inside][:, 1:].max() < 0.05

@@ -9,7 +9,7 @@ import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 from physgen.sim.reconstruct.lighting.ground_lighting import MAX_SHARE
 from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps, ground_axes
-from physgen.sim.reconstruct.lighting.light_estimate import with_spots
+from physgen.sim.reconstruct.lighting.light_estimate import KEY_SHARE, KEY_SPREAD, with_soft_key, with_spots
 from physgen.sim.scene.environment import ground_light, lamps_in
 from physgen.sim.scene.model import Ground
 
@@ -92,3 +92,55 @@ def test_a_spot_in_a_map_is_found_again_and_an_even_or_overcast_sky_has_none():
     height = np.clip(np.sin(np.linspace(math.pi / 2, -math.pi / 2, 32)), 0.0, 1.0)[:, None, None]
     overcast = np.broadcast_to((1.0 + 2.0 * height) / 3.0, even.shape).astype(np.float32)
     assert lamps_in(even, normal) == [] and lamps_in(overcast, normal) == []
+
+
+def on_white(lamps, exposure=1.6):
+    """``photo`` of white paper that the camera clips wherever it is lit."""
+    pixels, mask, mesh = photo(lamps)
+    white = np.clip(np.round(pixels.astype(np.float64) * exposure), 0, 255).astype(np.uint8)
+    assert (white[~mask].min(axis=-1) >= 254).mean() > 0.9
+    return white, mask, mesh
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "share"), [(150.0, 50.0, 0.7), (300.0, 40.0, 0.5)])
+def test_a_lamp_is_found_by_its_shadow_on_clipped_white(azimuth, elevation, share):
+    direction = towards(azimuth, elevation)
+    white, mask, mesh = on_white([(direction, share)])
+    (lamp,) = estimate_lamps(CAMERA, Ground(), white, [mask], [mesh])
+    assert math.degrees(math.acos(min(1.0, float(np.dot(lamp.direction, direction))))) < 20.0
+
+
+def test_a_soft_light_on_clipped_white_is_no_more_than_a_weak_lamp_above():
+    white, mask, mesh = on_white([])
+    for lamp in estimate_lamps(CAMERA, Ground(), white, [mask], [mesh]) or ():
+        assert lamp.share < 0.2 and lamp.direction[2] > math.sin(math.radians(70.0)) and lamp.angle > 0.4
+
+
+def test_white_without_any_shadow_says_nothing():
+    pixels, mask, mesh = photo([])
+    white = np.where(mask[..., None], pixels, np.uint8(255))
+    assert estimate_lamps(CAMERA, Ground(), white, [mask], [mesh]) is None
+
+
+def test_other_things_on_the_ground_are_no_ground():
+    direction = towards(215.0, 45.0)
+    pixels, mask, mesh = photo([(direction, 0.5)])
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    things = ((columns // 24 + rows // 24) % 4 == 0) & ~mask
+    pixels[things] = np.random.default_rng(1).integers(0, 120, (int(things.sum()), 1), dtype=np.uint8)
+    (lamp,) = estimate_lamps(CAMERA, Ground(), pixels, [mask], [mesh], things=things)
+    assert math.degrees(math.acos(min(1.0, float(np.dot(lamp.direction, direction))))) < 8.0
+    assert lamp.share == pytest.approx(0.5, abs=0.15)
+
+
+def test_a_soft_key_gives_its_share_of_the_grounds_light_from_around_the_zenith():
+    even = np.full((32, 64, 3), 1.0, np.float32) * np.array([0.9, 1.0, 1.1], np.float32)
+    lit = with_soft_key(even, Ground())
+    axes = ground_axes(Ground())
+    ways, weights = ground_light(lit, axes)
+    near = (ways @ axes)[:, 2] > math.cos(3.0 * KEY_SPREAD)
+    before_ways, before = ground_light(even, axes)
+    near_before = before[(before_ways @ axes)[:, 2] > math.cos(3.0 * KEY_SPREAD)].sum() / before.sum()
+    assert weights[near].sum() / weights.sum() == pytest.approx(KEY_SHARE + (1 - KEY_SHARE) * near_before, abs=0.03)
+    # White balance and exposure stay.
+    assert lit[16:].mean(axis=(0, 1)) / lit[16:].mean() == pytest.approx(even[0, 0] / even[0, 0].mean(), rel=1e-3)

@@ -39,6 +39,11 @@ MAX_POINTS = 7000
 MIN_POINTS = 300
 REACH = 2.8
 """Range of ground around an object, over its height: the shadow of a sun 20° high."""
+WHITE_GROUND = 0.5
+"""Share of clipped pixels beside the objects above which they are the lit ground, white paper, and not highlights on
+it: without them only its shadows are left to be compared with each other."""
+WHITE_SHARE = 2
+"""Most clipped points that are kept, over the others."""
 LUMINANCE_F32 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
@@ -48,7 +53,7 @@ class GroundObservation:
 
     caster: shadows at them. brightness: (N,) natural logarithm of the luminance. terms: (N, 6), ``smooth_terms``. sky:
     (N,) share of the environment's light that reaches them past the objects. rows, columns: (N,) their pixels in a
-    picture of ``size`` (width, height).
+    picture of ``size`` (width, height). white: (N,) where the photo is clipped, on ground that mostly is.
     """
 
     caster: ShadowCaster
@@ -58,6 +63,7 @@ class GroundObservation:
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     size: tuple[int, int]
+    white: Mask
 
 
 def ground_axes(ground: Ground) -> Points:
@@ -76,6 +82,7 @@ def observe_ground(
     masks: Sequence[Mask],
     meshes: Sequence[tuple[Points, NDArray[np.integer]]],
     sky: tuple[Points, Points] | None,
+    things: Mask | None = None,
 ) -> GroundObservation | None:
     """Return the visible ground around the objects in ``pixels`` (H, W, 3) sRGB, or None if there is too little.
 
@@ -87,12 +94,17 @@ def observe_ground(
     shrink = min(1.0, OBJECT_SIDE / _largest_side(masks), LONGEST_SIDE / max(width, height))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     linear = bytes_to_linear(pixels)
-    clipped = (pixels.max(axis=2) >= 254) | (pixels.max(axis=2) <= 2)
     luminance = cv2.resize(linear @ LUMINANCE_F32, size, interpolation=cv2.INTER_AREA)
-    objects = np.logical_or.reduce(masks) | (cv2.erode(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    objects = np.logical_or.reduce(masks if things is None else [*masks, things])
+    bright, black = pixels.max(axis=2) >= 254, pixels.max(axis=2) <= 2
+    beside = bright[_beside(masks) & ~objects]
+    on_white = len(beside) > 0 and bool(beside.mean() > WHITE_GROUND)
+    clipped = black if on_white else bright | black
+    objects = objects | (cv2.erode(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     covered = cv2.resize(objects.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
     # Pixels along an outline mix object and ground.
     covered = cv2.dilate(covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
+    white = cv2.resize((bright & on_white).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     rows, columns = np.nonzero(~covered & (luminance > 1e-4))
     seen = np.column_stack([(columns + 0.5) * width / size[0], (rows + 0.5) * height / size[1]])
     rays = camera.rays(seen) @ axes.T
@@ -109,6 +121,13 @@ def observe_ground(
             near |= outside < REACH * tall
     if near.sum() < MIN_POINTS:
         return None
+    blank = near & white[rows, columns]
+    most = max(MIN_POINTS, WHITE_SHARE * int((near & ~blank).sum()))
+    if blank.sum() > most:
+        # Robust fits would take the few points that show a shadow for outliers.
+        drawn = np.random.default_rng(0).choice(np.flatnonzero(blank), most, replace=False)
+        near = near & ~blank
+        near[drawn] = True
     index = np.flatnonzero(near)
     if len(index) > MAX_POINTS:
         index = np.random.default_rng(0).choice(index, MAX_POINTS, replace=False)
@@ -124,7 +143,22 @@ def observe_ground(
         rows=rows[index],
         columns=columns[index],
         size=size,
+        white=white[rows[index], columns[index]],
     )
+
+
+def _beside(masks: Sequence[Mask]) -> Mask:
+    """Pixels (H, W) no farther from one of ``masks`` than its own size, by boxes."""
+    found = np.zeros(masks[0].shape, dtype=bool)
+    for mask in masks:
+        if mask.any():
+            window = []
+            for axis in (1, 0):
+                lines = np.flatnonzero(mask.any(axis=axis))
+                extent = int(lines[-1] - lines[0]) + 1
+                window.append(slice(max(0, int(lines[0]) - extent), int(lines[-1]) + 1 + extent))
+            found[tuple(window)] = True
+    return found
 
 
 def _largest_side(masks: Sequence[Mask]) -> int:
@@ -172,15 +206,16 @@ def estimate_lamps(
     sky: tuple[Points, Points] | None = None,
     *,
     most: int = MOST_LAMPS,
+    things: Mask | None = None,
 ) -> tuple[LampEstimate, ...] | None:
     """Return the lamps of the photo ``pixels`` (H, W, 3) sRGB, strongest first, () for a soft light, or None if too
-    little ground is visible.
+    little ground is visible, or it is white throughout and says nothing.
 
     masks: (H, W) of all objects; meshes: vertices (V, 3) and faces (T, 3) of the same, in the units of ``camera``. sky:
     unit vectors (D, 3) in the ground's frame and weights (D,) of the environment; None for an overcast sky. most: how
-    many lamps at most.
+    many lamps at most. things: (H, W) what stands on the ground besides the objects, or None.
     """
-    view = observe_ground(camera, ground, pixels, masks, meshes, sky)
+    view = observe_ground(camera, ground, pixels, masks, meshes, sky, things)
     if view is None:
         return None
     search = _Search(view)
@@ -193,6 +228,8 @@ def estimate_lamps(
         if len(more) < len(lamps) or search.final(lamps)[1].cost > (1.0 - LEAST_GAIN) * alone:
             break
         kept = more
+    if not kept and (~view.white).sum() < MIN_POINTS:
+        return None
     axes = ground_axes(ground)
     found = []
     for lamp, share, clearness in kept:
@@ -222,6 +259,7 @@ class _Search:
             rows=view.rows[index],
             columns=view.columns[index],
             size=view.size,
+            white=view.white[index],
         )
         self._starts = _all_over()
         self._rough = [self._reaching(start, 5) for start in self._starts]

@@ -89,7 +89,7 @@ class LitScene:
     """Inputs of the light estimate, lengths in the camera's unit.
 
     pixels, background: (H, W, 3) sRGB, with and without objects; masks: (H, W) of all objects; meshes: vertices (V, 3)
-    and faces (T, 3) of the same.
+    and faces (T, 3) of the same. things: (H, W) what stands on the ground besides the objects, or None.
     """
 
     camera: Camera
@@ -98,6 +98,7 @@ class LitScene:
     background: NDArray[np.uint8]
     masks: Sequence[Mask]
     meshes: Sequence[Mesh]
+    things: Mask | None = None
 
 
 def estimate_light(
@@ -121,13 +122,15 @@ def estimate_light(
         return radiance, none
     # A map of the user's stays as it is: only a sun is added to it.
     most = MOST_LAMPS if given is None else 1
-    found = estimate_lamps(scene.camera, scene.ground, scene.pixels, scene.masks, scene.meshes, sky, most=most)
+    found = estimate_lamps(
+        scene.camera, scene.ground, scene.pixels, scene.masks, scene.meshes, sky, most=most, things=scene.things
+    )
     if found is None:
         notice("too little ground is visible to estimate the sun; it is set above, left and behind")
         return radiance, light_with_sun(none, DEFAULT_SUN, DEFAULT_STRENGTH, DEFAULT_ANGLE)
     if not found:
-        notice("no object casts a clear shadow: the light is soft, without a sun (physgen light sets one)")
-        return radiance, none
+        notice("no object casts a clear shadow: the light is soft, from above, without a sun (physgen light sets one)")
+        return radiance if given is not None else with_soft_key(radiance, scene.ground), none
     sun, others = found[0], found[1:]
     rest = 1.0 - sum(lamp.share for lamp in found)
     radiance = with_spots(radiance, scene.ground, [(lamp, lamp.share / rest) for lamp in others])
@@ -139,6 +142,26 @@ def estimate_light(
             "; this lamp is a spot in the environment map"
         )
     return radiance, light
+
+
+KEY_SHARE, KEY_SPREAD = 0.45, 0.3
+"""Share of the ground's light that comes from around the zenith where no lamp is found, and its standard deviation in
+rad. Rooms have lamps and windows, and clouds are thinner somewhere: under an even sky a thing that is up by a third of
+its size leaves hardly a shadow. Judged by eye on one photo."""
+
+
+def with_soft_key(radiance: Radiance, ground: Ground) -> Radiance:
+    """Return ``radiance`` with a soft light around the zenith of ``ground``, again of mean luminance 1.
+
+    It has the colour of the map's light on the ground, of which it then is ``KEY_SHARE``.
+    """
+    towards, solid = directions(*radiance.shape[:2])
+    height = np.clip(towards @ ground.unit_normal, -1.0, 1.0)
+    cosine = np.maximum(height, 0.0) * solid
+    lobe = np.exp(-0.5 * np.square(np.arccos(height) / KEY_SPREAD))
+    colour = np.tensordot(cosine, radiance, axes=2)
+    found = radiance + lobe[..., None] * (colour * (KEY_SHARE / (1.0 - KEY_SHARE) / float((lobe * cosine).sum())))
+    return np.asarray(found / float(((found @ LUMINANCE) * solid).sum() / solid.sum()), dtype=np.float32)
 
 
 SPOT_SIZE = (512, 256)

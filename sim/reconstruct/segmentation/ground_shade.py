@@ -257,9 +257,10 @@ def _brighter_than_beyond(light: Light, part: Mask, mask: Mask, free: Mask, oute
     ``mask`` and ``free`` of others, all (h, w), by the natural logarithm ``light``; only where both are seen. Pixels of
     mixed colours along the outline do not count."""
     kernel = np.ones((3, 3), np.uint8)
-    sides = part & (cv2.erode(mask.astype(np.uint8), kernel) > 0), free & ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    inside = part & (cv2.erode(mask.astype(np.uint8), kernel) > 0)
+    beyond = free & ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
     means, seen = [], outer
-    for side in sides:
+    for side in (inside, beyond):
         weight = side.astype(np.float32)
         total = cv2.GaussianBlur(weight, (0, 0), BESIDE)
         means.append(cv2.GaussianBlur(light * weight, (0, 0), BESIDE) / np.maximum(total, 1e-6))
