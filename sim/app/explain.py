@@ -29,7 +29,7 @@ from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
 from ..diagnose.report.wording import found_effects, remains
-from ..diagnose.run_diagnosis import DiagnoseOptions
+from ..diagnose.run_diagnosis import REFITTED, DiagnoseOptions
 from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
@@ -152,10 +152,6 @@ def explain(
         closed=closed,
         notes=tuple(notes),
     )
-
-
-REFITTED = 0.999
-"""Share of the error below which re-fitted contacts changed the motion."""
 
 
 def title_of_cause(diagnosis: Diagnosis) -> str:

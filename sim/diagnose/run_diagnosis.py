@@ -194,17 +194,20 @@ def fit_candidates(
     return fit_soft(capture, options.effects, on_event=on_event, cancelled=cancelled, work=work)
 
 
+REFITTED = 0.999
+"""Share of the error below which re-fitted contacts count as a change of the motion: less is rounding."""
+
+
 def found_fit(fits: FittedModels, weighed: ModelComparison) -> CandidateFit:
     """Return the fit that predicts ``after``: the verdict's.
 
     For ``none`` that is the nominal model, for ``unknown`` the re-fitted one where it predicts better.
     """
     name = weighed.verdict.effect
-    if name == UNKNOWN and fits.refitted.heldout_rms_m < fits.nominal.heldout_rms_m:
-        return fits.refitted
     if name not in (NONE, UNKNOWN):
         return weighed.best[name]
-    return min(fits.nominal, nominal_or_refitted(fits), key=lambda fit: fit.heldout_rms_m)
+    other = fits.refitted if name == UNKNOWN else nominal_or_refitted(fits)
+    return other if other.heldout_rms_m < REFITTED * fits.nominal.heldout_rms_m else fits.nominal
 
 
 def _confirm(

@@ -24,8 +24,9 @@ from physgen.sim.diagnose.diagnosis import (
     Verdict,
 )
 from physgen.sim.diagnose.gap_metrics import carried_residual, localise
-from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
+from physgen.sim.diagnose.model_comparison import ComparisonSettings, ModelComparison, compare_models
 from physgen.sim.diagnose.report.wording import assumptions, verdict_summary
+from physgen.sim.diagnose.run_diagnosis import found_fit
 from physgen.sim.diagnose.suggested_experiments import next_experiment, recorded_setting
 from physgen.sim.errors import InputError
 
@@ -348,6 +349,19 @@ def discrepancy(trial, scores):
         ),
         directions={"normal": 1.0, "along_velocity": 0.0, "along_gravity": 0.0, "other": 0.0},
     )
+
+
+def test_what_differs_by_rounding_is_the_same_motion():
+    """Re-fitted contacts of a flight: the comparison said *the same motion* and drew another curve."""
+    nominal = fit(misfit=9.0, rms=0.0214)
+    for rms, other in ((0.0214 * (1 - 1e-14), False), (0.0213, True), (0.0215, False)):
+        refitted = dataclasses.replace(fit(misfit=9.0, rms=rms), log_evidence=1.0)
+        models = Found(nominal=nominal, refitted=refitted, candidates=())
+        for effect in (NONE, UNKNOWN):
+            weighed = ModelComparison(
+                verdict=Verdict(effect=effect, probability=0.9), probabilities={}, best={}, reasons={}
+            )
+            assert found_fit(models, weighed) is (refitted if other else nominal)
 
 
 def test_shares_of_time_follow_the_scores():

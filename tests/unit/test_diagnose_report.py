@@ -81,6 +81,26 @@ def test_hostile_names_stay_text(tmp_path):
     assert "<script>alert(1)</script>" in said(page)
 
 
+@pytest.mark.parametrize(("found", "way"), [(0.322, "lower"), (0.71, "higher")])
+def test_a_coefficient_is_said_beside_what_was_assumed(found, way, tmp_path):
+    diagnosis, capture = case(
+        verdict=Verdict(effect="friction", probability=0.98),
+        effects=(
+            RankedEffect(
+                name="friction",
+                kind="contact",
+                probability=0.98,
+                parameters={"friction": Estimate(value=found, unit="1", low=found - 0.01, high=found + 0.01)},
+            ),
+        ),
+    )
+    believed = dataclasses.replace(capture, ground=dataclasses.replace(capture.ground, friction=0.5))
+    text = said(written(diagnosis, believed, tmp_path / "a")[0])
+    assert f"Friction is {way} than assumed: {found:.3f}, not 0.500." in text
+    same = dataclasses.replace(capture, ground=dataclasses.replace(capture.ground, friction=found))
+    assert "than assumed:" not in said(written(diagnosis, same, tmp_path / "b")[0])
+
+
 @pytest.mark.parametrize("effect", ["none", "unknown"])
 def test_a_verdict_without_effect_adds_nothing(effect, tmp_path):
     verdict = Verdict(effect=effect, probability=0.9)

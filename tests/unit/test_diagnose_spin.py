@@ -13,6 +13,7 @@ from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_mo
 from physgen.sim.diagnose.rigid import fit_rigid
 from physgen.sim.diagnose.rigid.bending import shape_scores
 from physgen.sim.diagnose.rigid.observed_poses import LEFT, observe_body
+from physgen.sim.diagnose.rigid.shared_spins import LEAST, likeliest_variances, share_spins
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, fit_candidates
 from physgen.sim.diagnose.work import Work
 from scipy.integrate import solve_ivp
@@ -71,7 +72,8 @@ def withheld(fits, fit, truth):
 
 @pytest.mark.long
 def test_a_spin_that_no_marker_shows_is_found_beside_drag():
-    capture, truth = rallies(2)
+    # 0.28 s tell the spin across the path, and nothing of that along it: the other takes do.
+    capture, truth = rallies(2, shown=0.4, duration=0.7)
     fits = fit_rigid(capture, ["air_drag", "magnus", "gravity_tilt"])
     weighed = compare_models(fits, ComparisonSettings())
     assert set(weighed.verdict.effects) == {"air_drag", "magnus"} and weighed.verdict.probability > 0.8
@@ -80,16 +82,52 @@ def test_a_spin_that_no_marker_shows_is_found_beside_drag():
     assert drag.low < DRAG < drag.high and drag.value == pytest.approx(DRAG, rel=0.05)
     alone = next(c for c in fits.candidates if c.effects == ("air_drag",))
     assert withheld(fits, found, truth) < 0.025 < withheld(fits, alone, truth) < withheld(fits, fits.nominal, truth)
+    assert 0.5 * withheld(fits, found, truth) < fits.floor_rms_m < 0.025
     # The path tells what lift and spin make together, not each: take by take, across the motion.
     fit = fits.bodies[0].fits[found.effects]
-    assert found.parameters["magnus"]["lift_per_mass"].value > 0
+    assert 0 < found.parameters["magnus"]["lift_per_mass"].low < LIFT < found.parameters["magnus"]["lift_per_mass"].high
     assert max(t.observations.sigma for t in fit.problem.trials) < 1.5 * SIGMA
+    spins_are_shared(fit)
+
+
+def spins_are_shared(fit):
+    """The spin along a path is held to be as small as in the other takes, whatever a take itself seems to have."""
+    trials = fit.problem.trials
+    for trial, states in zip(trials, fit.states, strict=True):
+        way = states[0, 7:10] / np.linalg.norm(states[0, 7:10])
+        along, whole = way @ trial.spin_cover @ way, np.trace(trial.spin_cover)
+        assert along < 0.5 * (whole - along) < trial.prior[9] ** 2
+    other = [s.copy() for s in fit.states]
+    other[0][0, 10:13] *= 3.0
+    plain = [dataclasses.replace(t, spin_cover=None) for t in trials]
+    problem = dataclasses.replace(fit.problem, trials=plain)
+    again = share_spins(dataclasses.replace(fit, problem=problem, states=other)).problem.trials
+    assert again[0].spin_cover == pytest.approx(trials[0].spin_cover, rel=0.3)
+    assert np.trace(again[1].spin_cover) > 1.5 * np.trace(trials[1].spin_cover)
+    # Two other takes tell too little.
+    few = dataclasses.replace(fit, problem=dataclasses.replace(problem, trials=plain[:3]), states=other[:3])
+    assert all(t.spin_cover is None for t in share_spins(few).problem.trials)
 
 
 def test_lift_is_not_found_where_nothing_spins():
     capture, _ = rallies(3, takes=3, spin=(0.0, 1e-6))
     weighed = compare_models(fit_rigid(capture, ["air_drag", "magnus"]), ComparisonSettings())
     assert weighed.verdict.effects == ("air_drag",)
+
+
+@given(st.integers(0, 99), st.floats(2.0, 200.0), st.floats(0.02, 1.0))
+def test_sizes_of_spins_are_those_of_well_seen_takes(seed, across, share):
+    rng = np.random.default_rng(seed)
+    spins = rng.normal(size=(12, 3)) * across * np.array([share, 1.0, 1.0])
+    sharp = [(1e4 * np.eye(3), 1e4 * w) for w in spins]
+    sizes = likeliest_variances(sharp, 300.0**2)
+    least = LEAST**2 * 300.0**2
+    assert sizes[0] == pytest.approx(max(np.mean(spins[:, 0] ** 2), least), rel=0.01, abs=1e-3)
+    assert sizes[1] == sizes[2] == pytest.approx(max(np.mean(spins[:, 1:] ** 2), least), rel=0.01, abs=1e-3)
+    # Takes that tell nothing leave them as they were; one that tells of one direction leaves the other.
+    assert likeliest_variances([(np.zeros((3, 3)), np.zeros(3))] * 4, 50.0) == pytest.approx([50.0] * 3)
+    half = [(np.diag([0.0, 1e4, 1e4]), np.array([0.0, *(1e4 * w[1:])])) for w in spins]
+    assert likeliest_variances(half, 300.0**2)[0] == pytest.approx(300.0**2)
 
 
 CAPTURE = rallies(1, takes=1)[0]

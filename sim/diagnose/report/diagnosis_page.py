@@ -118,7 +118,7 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         pictures=pictures,
         version=VERSION,
         headline=title,
-        explanation=[s for s in (meaning(diagnosis), alternatives_sentence(verdict)) if s],
+        explanation=[s for s in (meaning(diagnosis, capture), alternatives_sentence(verdict)) if s],
         facts=_facts(diagnosis),
         notes=list(dict.fromkeys(notes)),
         shares=_shares(diagnosis, several=len(capture.objects) > 1),

@@ -140,7 +140,17 @@ def _sureness(probability: float) -> str:
     return "only the best guess"
 
 
-def meaning(diagnosis: Diagnosis) -> str:
+def _against_belief(name: str, diagnosis: Diagnosis, capture: Capture) -> str:
+    """Return in which direction a contact coefficient was assumed wrong; "" of other effects and unknown beliefs."""
+    believed = {"friction": capture.ground.friction, "restitution": capture.ground.restitution}.get(name)
+    found = next((i.parameters[name].value for i in diagnosis.effects if i.name == name and name in i.parameters), None)
+    if believed is None or found is None or number_text(found) == number_text(believed):
+        return ""
+    way, label = "higher" if found > believed else "lower", effect_label(name).capitalize()
+    return f"{label} is {way} than assumed: {number_text(found)}, not {number_text(believed)}."
+
+
+def meaning(diagnosis: Diagnosis, capture: Capture) -> str:
     """Return what the verdict means physically, in a sentence or two."""
     verdict = diagnosis.verdict
     if verdict.effect == NONE and remains(diagnosis.gap):
@@ -149,7 +159,7 @@ def meaning(diagnosis: Diagnosis) -> str:
             "may be off in a way that is not modelled, such as its scale, its view or a body that is not as assumed."
         )
     names = found_effects(verdict) or (verdict.effect,)
-    said = [_MEANING[n] for n in names if n in _MEANING]
+    said = [_against_belief(n, diagnosis, capture) or _MEANING[n] for n in names if n in _MEANING]
     if verdict.effect == UNKNOWN:
         why = next((item.reason for item in diagnosis.effects if item.name == NONE), "")
         said += [f"The nominal model is ruled out: {why}."] if why else []

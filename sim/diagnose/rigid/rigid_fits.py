@@ -58,6 +58,7 @@ from .rigid_search import (
     refit_best,
     sharpen,
 )
+from .shared_spins import share_spins
 
 Array = NDArray[np.float64]
 
@@ -185,6 +186,8 @@ def fit_rigid(
                 break
             # Sharper noise may leave room for a second effect.
             search_pairs(body, wanted)
+        if body.problem.scene.unscaled:
+            body.fits = {k: share_spins(f) if "magnus" in k else f for k, f in body.fits.items()}
         tick("pairs")
     fits = _assemble(capture, bodies)
     tick("judged")
@@ -298,6 +301,8 @@ def _candidate(
     rng = np.random.default_rng(0)
     values, vectors = np.linalg.eigh(spread)
     draws = fit.z + (vectors * np.sqrt(np.clip(values, 0.0, 4.0)) @ rng.normal(size=(fit.model.size, 64))).T
+    if scene.unscaled and "magnus" in key:
+        _as_a_factor(draws, fit, "magnus")
     parameters = {name: _estimates(scene, fit, name, draws) for name in key}
     beliefs = {}
     for n, unit in (("friction", "1"), ("restitution", "1")):
@@ -329,13 +334,29 @@ def _candidate(
     )
 
 
-def _amount(fit: Fit, name: str) -> float:
+def _place(fit: Fit, name: str) -> int | None:
+    """Return where the first number of the effect ``name`` lies in those of ``fit``; None without it."""
     at = BELIEFS.size
     for candidate in fit.model.candidates:
         if candidate.name == name:
-            return float(fit.z[at])
+            return at
         at += candidate.size
-    return 0.0
+    return None
+
+
+def _amount(fit: Fit, name: str) -> float:
+    at = _place(fit, name)
+    return 0.0 if at is None else float(fit.z[at])
+
+
+def _as_a_factor(draws: Array, fit: Fit, name: str) -> None:
+    """Spread the first number of ``name`` in ``draws`` (N, P) as a factor, in place, where it is surely not zero.
+
+    A path tells the product of lift and a spin that nothing shows: less lift is more spin, and no lift none at all.
+    """
+    at = _place(fit, name)
+    if at is not None and abs(fit.z[at]) > float(draws[:, at].std()):
+        draws[:, at] = fit.z[at] * np.exp(draws[:, at] / fit.z[at] - 1.0)
 
 
 def _other_contact(name: str, value: float, normal: Array) -> Array:

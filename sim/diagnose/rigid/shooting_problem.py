@@ -42,8 +42,9 @@ CONTACT_DEGREES_OF_FREEDOM = 4.0
 class SegmentedTrial:
     """A body in a trial, split at nodes. nodes: (N,) frames, rising. states: (N, 13). end: frame after the last used.
 
-    prior: (12,) standard deviation of the initial guess of the first state. Per segment: covers, (12, 12) covariance
-    of the defect at its end; weights, (F,) of its frames.
+    prior: (12,) standard deviation of the initial guess of the first state. spin_cover: (3, 3) covariance of its spin
+    in its place, where other takes tell it. Per segment: covers, (12, 12) covariance of the defect at its end; weights,
+    (F,) of its frames.
     """
 
     observations: ObservedBody
@@ -54,6 +55,7 @@ class SegmentedTrial:
     prior: Array
     covers: list[Array] = field(default_factory=list)
     weights: list[Array] = field(default_factory=list)
+    spin_cover: Array | None = None
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -339,10 +341,12 @@ class Problem:
                 part.hessian[low, low] += np.outer(rise, rise) / SUNK**2
                 part.slope[low] -= rise * sunk / SUNK
         if j == 0:
-            off = state_difference(state, trial.guess) / trial.prior
-            part.cost += float(off @ off)
-            part.hessian[own, own] += np.diag(trial.prior**-2.0)
-            part.slope[own] += off / trial.prior
+            off, known = state_difference(state, trial.guess), np.diag(trial.prior**-2.0)
+            if trial.spin_cover is not None:
+                known[9:, 9:] = np.linalg.inv(trial.spin_cover)
+            part.cost += float(off @ known @ off)
+            part.hessian[own, own] += known
+            part.slope[own] += known @ off
 
     def _variants(
         self, model: Model, z: Array, slopes: bool, held: bool, fixed: bool
