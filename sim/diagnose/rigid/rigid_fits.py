@@ -19,7 +19,7 @@ from ..diagnosis import CandidateFit, Discrepancy, Estimate
 from ..work import Work
 from .bending import bending
 from .multiple_shooting import Fit
-from .pair_search import search_pairs
+from .pair_search import BASE_GAIN, search_pairs
 from .rigid_candidates import (
     BELIEFS,
     CANDIDATE_EFFECTS,
@@ -301,8 +301,11 @@ def _candidate(
     rng = np.random.default_rng(0)
     values, vectors = np.linalg.eigh(spread)
     draws = fit.z + (vectors * np.sqrt(np.clip(values, 0.0, 4.0)) @ rng.normal(size=(fit.model.size, 64))).T
-    if scene.unscaled and "magnus" in key:
-        _as_a_factor(draws, fit, "magnus")
+    others = tuple(name for name in key if name != "magnus")
+    if scene.unscaled and others != key and all(others in b.fits for b in bodies):
+        gain = sum(b.fits[key].evidence - b.fits[others].evidence for b in bodies)
+        if gain > BASE_GAIN:
+            _as_a_factor(draws, fit, "magnus")
     parameters = {name: _estimates(scene, fit, name, draws) for name in key}
     beliefs = {}
     for n, unit in (("friction", "1"), ("restitution", "1")):
@@ -350,13 +353,13 @@ def _amount(fit: Fit, name: str) -> float:
 
 
 def _as_a_factor(draws: Array, fit: Fit, name: str) -> None:
-    """Spread the first number of ``name`` in ``draws`` (N, P) as a factor, in place, where it is surely not zero.
+    """Spread the first number of ``name`` in ``draws`` (N, P), which is not zero, as a factor, in place.
 
     A path tells the product of lift and a spin that nothing shows: less lift is more spin, and no lift none at all.
     """
     at = _place(fit, name)
-    if at is not None and abs(fit.z[at]) > float(draws[:, at].std()):
-        draws[:, at] = fit.z[at] * np.exp(draws[:, at] / fit.z[at] - 1.0)
+    if at is not None and abs(fit.z[at]) > 1e-3:
+        draws[:, at] = fit.z[at] * np.exp(np.clip(draws[:, at] / fit.z[at] - 1.0, -3.0, 3.0))
 
 
 def _other_contact(name: str, value: float, normal: Array) -> Array:
