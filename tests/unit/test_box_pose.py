@@ -56,6 +56,23 @@ def test_outlines_of_a_box_tell_camera_path_and_turn(edges):
     assert np.degrees(abs((apart.mean() + cycle / 2) % cycle - cycle / 2)) < 2.0
 
 
+@pytest.mark.parametrize("edges", [(0.06, 0.06, 0.06), (0.08, 0.05, 0.04)])
+def test_frames_in_which_something_joins_the_outline_are_named(edges):
+    edges = np.array(edges)
+    _, centres, turns = slide(edge=edges[2])
+    seen = outlines(centres, turns, edges, np.random.default_rng(2))
+    plain = follow_box(seen, edges, (640, 360))
+    for k in (20, 21, 22):
+        # A dark patch along a whole side, as of a contact shadow that counts as body for three frames.
+        low = seen[k][seen[k][:, 1] > np.median(seen[k][:, 1])]
+        hull = np.concatenate([seen[k], low + np.array([9.0, 9.0])]).astype(np.float32)
+        seen[k] = cv2.convexHull(hull)[:, 0].astype(np.float64)
+    found = follow_box(seen, edges, (640, 360))
+    assert plain is not None and plain.sound.mean() > 0.9
+    assert found is not None and not found.sound[20:23].any()
+    assert found.sound.sum() >= plain.sound.sum() - 5
+
+
 def test_a_shadow_beside_the_box_does_not_move_it():
     edges = np.full(3, 0.06)
     _, centres, turns = slide()

@@ -9,7 +9,7 @@ direction, so that nothing has to be matched. Shadows and other spurs stand out 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,9 @@ STARTS, YAWS = 8, 6
 POOR, POOR_PX, POOR_AT = 0.008, 0.1, 0.7
 """Residual of an outline that this share of directions stays below, over the box's size in the picture and in px, from
 which no box is seen: a disc of 80 px leaves 0.010 of its size, the outlines of a real cube 0.004."""
+NEIGHBOURS, STANDS_OUT, LEAST_OUT_PX = 4, 5.0, 0.1
+"""Frames on each side that a frame's outline is compared with; robust standard deviations, each at least so many px, by
+which its growth or its residual differ from theirs if something else, such as a shadow, has become a part of it."""
 FASTEST = 0.4
 """Turn from frame to frame, in shares of the angle after which the outline repeats, up to which it is followed."""
 
@@ -81,18 +84,19 @@ class GroundCamera:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoxMotion:
     """A box that slides on level ground. centres: (T, 3) m in the camera's world. turns: (T,) rad about z, continuous.
-    residual: px that 0.7 of an outline's directions
-    stay within of the box's, the median over frames. edges: (3,) m of the box."""
+    residual: px that 0.7 of an outline's directions stay within of the box's, the median over frames. edges: (3,) m of
+    the box. sound: (T,) whether the outline is one of the box alone, as in the frames next to it."""
 
     camera: GroundCamera
     centres: Array
     turns: Array
     residual: float
     edges: Array
+    sound: NDArray[np.bool_]
 
     def at(self, samples: NDArray[np.int64]) -> BoxMotion:
         """Return the motion at ``samples`` (N,) alone."""
-        return replace(self, centres=self.centres[samples], turns=self.turns[samples])
+        return replace(self, centres=self.centres[samples], turns=self.turns[samples], sound=self.sound[samples])
 
 
 def follow_box(outlines: Sequence[Array], edges: Array, picture: tuple[int, int]) -> BoxMotion | None:
@@ -115,7 +119,19 @@ def follow_box(outlines: Sequence[Array], edges: Array, picture: tuple[int, int]
     if np.abs(np.diff(turns)).max(initial=0.0) > FASTEST * cycle:
         return None
     centres = np.column_stack([states[:, :2], np.full(len(states), edges[2] / 2)])
-    return BoxMotion(camera=_camera(camera, picture), centres=centres, turns=turns, residual=residual, edges=edges)
+    sound = ~(stands_out(states[:, 3], np.abs) | stands_out(misses, lambda off: off))
+    return BoxMotion(
+        camera=_camera(camera, picture), centres=centres, turns=turns, residual=residual, edges=edges, sound=sound
+    )
+
+
+def stands_out(values: Array, how: Callable[[Array], Array]) -> NDArray[np.bool_]:
+    """Return (T,) whether ``values`` (T,) px differ from the median of their neighbours by far more than they usually
+    do. how: what of the differences counts, such as their size, or they themselves where only more is wrong."""
+    near = [np.median(values[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1]) for k in range(len(values))]
+    off = values - np.array(near)
+    usual = max(1.4826 * float(np.median(np.abs(off))), LEAST_OUT_PX)
+    return np.asarray(how(off) > STANDS_OUT * usual)
 
 
 def repeats_after(edges: Array) -> float:

@@ -156,6 +156,9 @@ def follow_plain_body(
     last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
     step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
     kept = np.arange(view.first, last + 1, step)
+    part = np.arange(view.first, view.last + 1)
+    if box is not None:
+        kept, part = kept[box.sound[kept]], part[box.sound[part]]
     if len(kept) < LEAST_FRAMES:
         first, end = regions[int(kept[0])].frame, regions[int(kept[-1])].frame
         raise InputError(
@@ -163,7 +166,6 @@ def follow_plain_body(
             f"{LEAST_FRAMES}: film it at a higher frame rate, with nothing in front of it"
         )
     points = view.points[kept - view.first]
-    part = slice(view.first, view.last + 1)
     noise_of_centre = noise_px(path_px[part])
     if body.kind in ("box", "mesh") and view.kind == "surface":
         noise_of_centre = max(noise_of_centre, wobble_px(clock[part], path_px[part]))
@@ -172,7 +174,7 @@ def follow_plain_body(
         turns = box.turns[kept]
         # What a turn that is a little wrong moves the middles of the faces by, sideways.
         arm = 0.5 * float(np.mean(box.edges[:2])) * view.scale
-        aside = np.stack([box.turns[part] * arm, np.zeros(part.stop - part.start)], axis=1)
+        aside = np.stack([box.turns[part] * arm, np.zeros(len(part))], axis=1)
         noise_of_centre = max(noise_of_centre, wobble_px(clock[part], aside))
     trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre, turns)
     capture = check_capture(
