@@ -56,6 +56,7 @@ from .rigid_search import (
     refine_promising,
     refit_beliefs,
     refit_best,
+    settle_on_a_face,
     sharpen,
 )
 from .shared_spins import share_spins
@@ -177,6 +178,7 @@ def fit_rigid(
         refit_beliefs(body)
         tick("refitted")
         refit_best(body)
+        settle_on_a_face(body)
         refine_promising(body)
         reconsider_nominal(body)
         tick("best again")

@@ -387,6 +387,29 @@ def refit_best(body: BodyFits) -> None:
                 body.work.skip((fit.model.candidates[0].name,), "followed through its own contacts")
 
 
+SETTLINGS = 4
+"""Times that the best effect of a body that turns on a face is followed."""
+
+
+def settle_on_a_face(body: BodyFits) -> None:
+    """Follow the best effect of a body that slides and turns on one face until its nodes suit it, whatever it gains.
+
+    How friction brakes the turn depends on where the face carries, which the nominal model, with another friction,
+    moves to its limit: nodes and states of its fit suit no effect, and gains from there say little.
+    """
+    if not body.problem.scene.turns_on_a_face:
+        return
+    key = max((k for k in body.fits if len(k) == 1), key=lambda k: body.fits[k].evidence, default=None)
+    for _ in range(SETTLINGS):
+        if key is None or misfit(body.fits[key]).ratio < FOLLOWED_MISFIT:
+            return
+        if not body.work.left():
+            body.work.skip(key, "followed through its own contacts")
+            return
+        fit = followed(body, body.fits[key].model, body.fits[key].z)
+        keep(body, key, solve(fit.problem, fit.model, fit.z, fit.states, rounds=ROUNDS))
+
+
 SHARPENED = 0.8
 """Factor on the assumed noise below which all fits are repeated with what the closest one leaves."""
 
