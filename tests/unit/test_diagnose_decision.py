@@ -25,7 +25,7 @@ from physgen.sim.diagnose.diagnosis import (
 )
 from physgen.sim.diagnose.gap_metrics import carried_residual, localise
 from physgen.sim.diagnose.model_comparison import ComparisonSettings, ModelComparison, compare_models
-from physgen.sim.diagnose.report.wording import assumptions, verdict_summary
+from physgen.sim.diagnose.report.wording import alternatives_sentence, assumptions, verdict_summary
 from physgen.sim.diagnose.run_diagnosis import found_fit
 from physgen.sim.diagnose.suggested_experiments import next_experiment, recorded_setting
 from physgen.sim.errors import InputError
@@ -398,6 +398,9 @@ def test_the_verdict_in_words():
     assert "clock" in text and "buoyancy" in text and "60 %" in text and "89 %" in text
     # One rounding on the whole page: the table shows 99.6 %.
     assert "(99.6 % confidence)" in verdict_summary(dataclasses.replace(verdict, probability=0.9964), GAP)
+    pair = Verdict(effect="air_drag", probability=0.6, alternatives=("magnus", "wind"), effects=("air_drag", "magnus"))
+    assert "cannot rule out Magnus lift alone or wind" in verdict_summary(pair, GAP)
+    assert "distinguish them from Magnus lift alone or wind" in str(alternatives_sentence(pair))
     unsure = dataclasses.replace(GAP, resolvable=False)
     assert "too close to the noise" in verdict_summary(verdict, unsure)
     assert "explains" in verdict_summary(Verdict(effect=NONE, probability=0.9), GAP)

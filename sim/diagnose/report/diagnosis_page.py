@@ -21,6 +21,7 @@ from .object_heatmaps import VIEWS
 from .wording import (
     DIRECTIONS,
     PHASES,
+    alternative_label,
     alternatives_sentence,
     assumptions,
     closure_sentence,
@@ -167,7 +168,8 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     explained = "Probability that no known effect is missing" if remains(gap) else "Probability that nothing is missing"
     probability = {NONE: explained, UNKNOWN: "Probability of an unknown cause"}
     chances = {item.name: item.probability for item in diagnosis.effects}
-    others = (f"{effect_label(n)} {percent_text(chances[n])}" for n in verdict.alternatives[:3] if n in chances)
+    alternatives = [n for n in verdict.alternatives[:3] if n in chances]
+    others = (f"{alternative_label(verdict, n)} {percent_text(chances[n])}" for n in alternatives)
     name = probability.get(verdict.effect, "Probability of this cause")
     facts = [(name, percent_text(verdict.probability), ", ".join(others))]
     if not gap.resolvable:

@@ -166,17 +166,23 @@ def meaning(diagnosis: Diagnosis, capture: Capture) -> str:
     return " ".join(said)
 
 
+def alternative_label(verdict: Verdict, name: str) -> str:
+    """Return the label of the alternative ``name``; one of several causes that the verdict names is one "alone"."""
+    several = found_effects(verdict)
+    return f"{effect_label(name)} alone" if len(several) > 1 and name in several else effect_label(name)
+
+
 def alternatives_sentence(verdict: Verdict) -> str | None:
     """Return the sentence on effects that cannot be distinguished from the verdict; None without any."""
     if not verdict.alternatives:
         return None
-    others = listed([effect_label(name) for name in verdict.alternatives], "or")
+    others = listed([alternative_label(verdict, name) for name in verdict.alternatives], "or")
     if verdict.effect == NONE:
         return f"Too small for this recording to rule out: {others}."
     if verdict.effect == UNKNOWN:
         return f"Closest known effects, but not good enough: {others}."
     return (
-        f"This recording cannot distinguish it from {others}. "
+        f"This recording cannot distinguish {'it' if len(found_effects(verdict)) < 2 else 'them'} from {others}. "
         "Treat them as one finding until another recording decides."
     )
 
@@ -401,7 +407,7 @@ def _object(item: CaptureObject) -> str:
 
 def verdict_summary(verdict: Verdict, gap: Gap) -> str:
     """Return the verdict in a sentence or two: cause, confidence, alternatives, gap closure."""
-    others = listed([effect_label(name) for name in verdict.alternatives], "or")
+    others = listed([alternative_label(verdict, name) for name in verdict.alternatives], "or")
     if verdict.effect == NONE:
         if remains(gap):
             return (
