@@ -23,7 +23,7 @@ from .kernels.kernel_arrays import (
     WorldArrays,
 )
 from .kernels.lanes import Lanes
-from .kernels.layout import BLOCK_NODES, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, vec4
+from .kernels.layout import BLOCK, BLOCK_NODES, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, vec4
 from .kernels.runtime import new_array
 from .rigid.rigid_bodies import RigidBodies
 
@@ -59,7 +59,9 @@ class BlockLists:
         if p > self._p_capacity:
             self._p_capacity = p
             self._p_cells, self._p_field = new_array(ivec3, p), new_array(ti.i32, p)
-            self._starts, self._cursors = new_array(ti.i32, p + 1), new_array(ti.i32, p)
+            self._starts = new_array(ti.i32, p + 1)
+            # Of a card: how many particles a cell holds.
+            self._cursors = new_array(ti.i32, p * BLOCK**3 if self._lanes.parallel else p)
             self._p_neighbours = new_array(ti.i32, p * 27)
             self._near_of_p, self._near_p = new_array(ti.i32, p), new_array(ti.i32, p)
             self._meets_p, self._meet_p = new_array(ti.i32, p), new_array(ti.i32, p)
@@ -97,10 +99,10 @@ class BlockLists:
 
     # ---- listing ------------------------------------------------------------------------------------------------
 
-    def build(self, count: int, keys: ti.Ndarray, targets: ti.Ndarray) -> None:
+    def build(self, count: int, x: ti.Ndarray, keys: ti.Ndarray, targets: ti.Ndarray) -> None:
         """List the blocks and neighbours of ``count`` particles, and write into ``targets`` where each is to go.
 
-        keys: block of each particle, as ``sorting.block_key`` packs it.
+        x: their positions in the windows of their blocks; keys: block of each, as ``sorting.block_key`` packs it.
         """
         while True:
             self._p_keys.fill(-1)
@@ -109,7 +111,7 @@ class BlockLists:
                 break
             self._allocate(int(GROWTH * self._p_count) + LEAST_BLOCKS, 0)
         if self._lanes.parallel:
-            parallel_sorting.turn_counts_into_offsets_of(self._lanes)(self._cursors, self.particle_blocks)
+            parallel_sorting.turn_counts_into_offsets_of(self._lanes).launch(self.particle_blocks)
         # The serial list of the grid turns the counts of particles into offsets, once: they are put back for every new
         # attempt.
         counts = None
@@ -125,9 +127,12 @@ class BlockLists:
             if self._g_count <= self._g_capacity:
                 break
             self._allocate(0, int(GROWTH * self._g_count) + LEAST_BLOCKS)
-        sorting.link_blocks(self.particle_blocks, self.grid_blocks, self._p_table, self._g_table)
-        place = parallel_sorting.place_in_parallel if self._lanes.parallel else sorting.place
-        place(count, keys, self._cursors, targets, self._p_table)
+        sorting.link_blocks.launch(self.particle_blocks, self.grid_blocks, self._p_table, self._g_table)
+        if self._lanes.parallel:
+            blocks = self.particle_blocks
+            parallel_sorting.place_in_turn.launch(count, x, keys, self._cursors, targets, self._p_table, blocks)
+        else:
+            sorting.place.launch(count, keys, self._cursors, targets, self._p_table)
 
     def _list_particle_blocks(self, count: int, keys: ti.Ndarray) -> int:
         table, blocks = self._p_table, self.particle_blocks

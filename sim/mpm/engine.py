@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..events import IsCancelled
 from .block_lists import BlockLists, block_keys, bytes_of
-from .kernels import layout, parallel_sorting, runtime, sorting
+from .kernels import layout, parallel_sorting, runtime, sorting, time_stepping
 from .kernels.constitutive_response import law_set
 from .kernels.kernel_arrays import (
     AdhesionArrays,
@@ -27,7 +27,7 @@ from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
 from .kernels.layout import FIXED_ONE, ivec3, mat3, vec3, vec4
 from .kernels.runtime import new_array
-from .kernels.substep import rigid_launcher, substep_launcher
+from .kernels.substep import REPEATS, rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
 from .rigid.rigid_bodies import RigidBodies
@@ -105,7 +105,6 @@ class Engine:
         models = law_set(self.laws)
         self.world_count = len(numbers.worlds)
         self._running = new_array(ti.i32, self.world_count if lanes.parallel else 1)
-        self._launches = 1
         self.field_count = len(numbers.fields)
         self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
         several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
@@ -319,18 +318,19 @@ class Engine:
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
         rebase = parallel_sorting.rebase_of(self._lanes) if self._lanes.parallel else sorting.rebase
-        rebase(self._particles[0]["x"], self._keys, self._worlds(), self._blocks.particle_blocks)
+        rebase.launch(self._particles[0]["x"], self._keys, self._worlds(), self._blocks.particle_blocks)
         self._group()
 
     def _group(self, *, again: bool = False) -> None:
-        """Lists, neighbours and permutation for the blocks named in ``_keys``; ``again``: as the last time."""
-        self._blocks.build(self.count, self._keys, self._targets)
+        """Lists, neighbours and permutation for the blocks named in ``_keys``; ``again``: those of the last time. What
+        no substep changes has been moved already, and a card would find another order."""
         old, new = self._particles
         if not again:
+            self._blocks.build(self.count, old["x"], self._keys, self._targets)
             for name, move in HELD.items():
                 if name in self._names:
-                    move(self.count, self._targets, old[name], new["reaction"])
-        sorting.permute(self.count, self._targets, _state_of(old), _state_of(new))
+                    move.launch(self.count, self._targets, old[name], new["reaction"])
+        sorting.permute.launch(self.count, self._targets, _state_of(old), _state_of(new))
         movers = {
             "memory": sorting.permute_numbers,
             "slopes": sorting.permute_triples,
@@ -338,7 +338,7 @@ class Engine:
         }
         for name in self._names:
             if name in movers:
-                movers[name](self.count, self._targets, old[name], new[name])
+                movers[name].launch(self.count, self._targets, old[name], new[name])
         self._particles.reverse()
         self._blocks.list_contacts(self._worlds(), self.rigid_bodies, several=self._several)
 
@@ -377,8 +377,8 @@ class Engine:
             before = self.rigid_bodies.state() if self.rigid_bodies.count else None
             self._sort()
             while True:
-                prime_worlds(self._limits(), self._worlds())
-                self._run_substeps(stop)
+                prime_worlds.launch(self._limits(), self._worlds())
+                self._run_substeps(stop, self._expected_launches(control))
                 after = self.control()
                 lost = after[:, layout.STATUS] == layout.DIVERGED
                 if not lost.any():
@@ -405,8 +405,21 @@ class Engine:
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
         self._put_control(control)
 
-    def _run_substeps(self, stop: IsCancelled) -> None:
-        """Substeps until every world wants a sort, is done or has diverged."""
+    def _expected_launches(self, control: Array) -> int:
+        """Launches, at least 1, that pass at this state before the first world can want a sort or have come to its
+        end; none of them needs a look at the worlds before it."""
+        step, speed = self._stable_steps(control), control[:, layout.SPEED]
+        # Cells that may be covered, less what a world keeps free for the substep that follows.
+        room = 1.0 - time_stepping.LEAST_MARGIN
+        with np.errstate(divide="ignore"):
+            until_sort = room / (speed * step) - 2.0 * time_stepping.SAFETY
+        waiting = control[:, layout.STATUS] == layout.WANTS_SORT
+        substeps = np.minimum(control[:, layout.REMAINING] / step, until_sort)[waiting].max()
+        return int(np.clip((substeps + 1) // REPEATS, 1, MOST_LAUNCHES))
+
+    def _run_substeps(self, stop: IsCancelled, expected: int) -> None:
+        """Substeps until every world wants a sort, is done or has diverged; ``expected``: launches that it is sure to
+        take, about."""
         if not (self.count or self.rigid_bodies.solved_together):
             if stop():
                 raise Stopped
@@ -421,15 +434,13 @@ class Engine:
                     raise Stopped
                 launch()
             return
-        # A card goes on while the host prepares the next launch, unless the host waits to read: it does so when about
-        # as many substeps as last time are under way.
+        # A card goes on while the host prepares the next launch, unless the host waits to read.
         launches = 0
-        while launches < self._launches or self._running.to_numpy().any():
+        while launches < expected or self._running.to_numpy().any():
             if stop():
                 raise Stopped
             launch()
             launches += 1
-        self._launches = max(1, min(launches - 1, MOST_LAUNCHES))
 
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""

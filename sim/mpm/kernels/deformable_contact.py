@@ -80,7 +80,7 @@ from .layout import (
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
 from .surface_shares import LEAST_SLOPE, distance_from_middle, distance_of_share, slope_along
-from .windows import add_to, clear_window, gathered, store_window, sum_chosen_windows, weights
+from .windows import add_to, clear_window, first_of, gathered, layer, store_window, sum_chosen_windows, weights
 
 SWEEPS = 8
 """Passes over the pairs of bodies at a node where three or more meet and some are thin."""
@@ -132,9 +132,9 @@ def scatter_shares(
                     w3 = weights(fx)
                     # Derivatives of the weights by the node's place.
                     s3 = [1.5 - fx, 2.0 * (fx - 1.0), 0.5 - fx]
-                    first = offset + base[0] * 64 + base[1] * 8 + base[2]
+                    first = offset + first_of(base, pads.scattered)
                     for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                        n = first + (i * 64 + j * 8 + m)
+                        n = first + (i * ti.static(layer(pads.scattered)) + j * 8 + m)
                         share = volume * vec4(
                             s3[i][0] * w3[j][1] * w3[m][2],
                             w3[i][0] * s3[j][1] * w3[m][2],

@@ -11,6 +11,7 @@ import taichi as ti
 
 from .kernel_arrays import FlowArrays, GridBlocks, NodeArrays, WorldArrays
 from .kernel_bundles import func
+from .lanes import NODE_THREADS
 from .layout import (
     ACCELERATION,
     ACCELERATION_RATE,
@@ -107,33 +108,49 @@ def drive(q: vec4, push: vec3, dt: ti.f32, drag: ti.f32, wind: vec3):
 
 
 @func
+def advance_node(
+    flowing: ti.template(), n: ti.i32, worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays
+):
+    """``advance_nodes`` for node ``n``."""
+    g = n // BLOCK_NODES
+    f = grid.field[g]
+    w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+    c = w * CONTROL_ROW
+    if worlds.control[c + PHASE] == FULL:
+        dt = ti.cast(worlds.control[c + STEP], ti.f32)
+        push = dt * steady_acceleration(f, w, dt, worlds)
+        wind = triple(worlds.field_numbers, f * FIELD_ROW + WIND)
+        q = gathered(g, n % BLOCK_NODES, grid.neighbours, None, nodes.scattered)
+        nodes.mass[n] = q[3]
+        if q[3] > 0.0:
+            if ti.static(flowing):
+                flow.velocity[n] = gathered(g, n % BLOCK_NODES, grid.neighbours, None, flow.scattered) / q[3]
+            q = drive(q, push, dt, worlds.field_numbers[f * FIELD_ROW + DRAG], wind)
+        elif ti.static(flowing):
+            flow.velocity[n] = vec4(0.0)
+        nodes.velocity[n] = q
+
+
+@func
 def advance_nodes_in_parallel(
     flowing: ti.template(),
     means: ti.template(),
+    lanes: ti.template(),
     worlds: WorldArrays,
     grid: GridBlocks,
     nodes: NodeArrays,
     flow: FlowArrays,
 ):
     """As ``advance_nodes``, a thread a node; ``means``: whether some fields' means are wanted."""
-    for n in range(grid.count * BLOCK_NODES):
-        g = n // BLOCK_NODES
-        f = grid.field[g]
-        w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
-        c = w * CONTROL_ROW
-        if worlds.control[c + PHASE] == FULL:
-            dt = ti.cast(worlds.control[c + STEP], ti.f32)
-            push = dt * steady_acceleration(f, w, dt, worlds)
-            wind = triple(worlds.field_numbers, f * FIELD_ROW + WIND)
-            q = gathered(g, n % BLOCK_NODES, grid.neighbours, None, nodes.scattered)
-            nodes.mass[n] = q[3]
-            if q[3] > 0.0:
-                if ti.static(flowing):
-                    flow.velocity[n] = gathered(g, n % BLOCK_NODES, grid.neighbours, None, flow.scattered) / q[3]
-                q = drive(q, push, dt, worlds.field_numbers[f * FIELD_ROW + DRAG], wind)
-            elif ti.static(flowing):
-                flow.velocity[n] = vec4(0.0)
-            nodes.velocity[n] = q
+    if ti.static(lanes.shared):
+        for start in range(NODE_THREADS):
+            n = start
+            while n < grid.count * BLOCK_NODES:
+                advance_node(flowing, n, worlds, grid, nodes, flow)
+                n += NODE_THREADS
+    else:
+        for n in range(grid.count * BLOCK_NODES):
+            advance_node(flowing, n, worlds, grid, nodes, flow)
     if ti.static(means):
         for g in range(grid.count):
             f = grid.field[g]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import taichi as ti
 
-from .layout import SPREAD, WINDOW_NODES, vec4
+from .layout import SPREAD, WINDOW, vec4
 
 
 class Lanes(NamedTuple):
@@ -33,20 +33,37 @@ class Lanes(NamedTuple):
     parallel: bool
     """Whether lists are made by all threads at once, in an order that is not repeatable."""
 
+    groups: int = 0
+    """Groups of ``threads`` that are launched to take blocks in turn, where windows are shared. A number that the
+    compiler knows needs no launch of its own to find, and no groups that find nothing to do."""
+
+    whole: bool = False
+    """Whether windows are summed in whole numbers, see ``whole_transfer``: shared memory adds those by itself, and
+    floats by compare-and-swap in a loop."""
+
     @property
     def span(self) -> int:
         """Loop iterations a block."""
         return self.threads if self.shared else SPREAD
 
     @property
-    def halvings(self) -> tuple[int, ...]:
-        """Half of the lanes, a quarter, … one."""
-        return tuple(self.threads >> level for level in range(1, self.threads.bit_length()))
+    def warps(self) -> int:
+        """Groups of WARP lanes, which run in step and can read from one another."""
+        return self.threads // WARP
 
+
+WARP = 32
+HALVES = (16, 8, 4, 2, 1)
+"""Half of a warp, a quarter, … one."""
+
+WHOLE_WARP = 0xFFFFFFFF
+"""Bits of all lanes of a warp."""
 
 SERIAL = Lanes(threads=1, shared=False, parallel=False)
 ALONE = Lanes(threads=1, shared=False, parallel=True)
-CUDA = Lanes(threads=512, shared=True, parallel=True)
+CUDA = Lanes(threads=128, shared=True, parallel=True, groups=4096, whole=True)
+"""128 threads a block get 255 registers each, enough for the pass over the particles; of 512 they get 64, and spill 1.2
+KB each. Measured on an H200; groups beyond those that run at once cost little."""
 
 
 def lanes_of(arch: str) -> Lanes:
@@ -64,34 +81,44 @@ def windows_of(arch: str, threads: int) -> int:
     return WINDOWS_A_THREAD * (threads or os.cpu_count() or 1) if arch == "cpu" else 2**31
 
 
+PADDED = WINDOW * WINDOW + 4
+"""Numbers from one layer of a window in shared memory to the next. With the four of padding, the cells of half a block
+lie in the 32 banks of that memory, one in each; without, in every second four of banks, two in each."""
+
+PADDED_NODES = WINDOW * PADDED
+
+
+NODE_THREADS = 1 << 17
+"""Threads of a card that take nodes in turn; known to the compiler, as ``Lanes.groups`` is."""
+
+
 class Pads(NamedTuple):
     """Memory that the lanes of a block share: SharedArrays on a card, otherwise the block's part of global arrays."""
 
     window: Any
-    """Nodes to read with ``node_of``: (4 WINDOW_NODES,) f32 in shared memory, component by component (Taichi has no
+    """Nodes to read with ``node_of``: (4 PADDED_NODES,) f32 in shared memory, component by component (Taichi has no
     atomic sums of vectors there), otherwise vec4."""
 
     scattered: Any
-    """Nodes to add to with ``add_to``."""
+    """Nodes to add to with ``add_to``; in shared memory f32 or, as whole numbers in units of the block's own, i32."""
 
     past_window: Any
     past_scattered: Any
     """The same two for ``FlowArrays``."""
 
     maxima: Any
-    """(4 lanes,) f32, for ``lane_maxima``; None without shared memory."""
-
-    sums: Any
-    """(lanes,) f32, for ``lane_sum``; None without shared memory."""
+    """(4 warps,) f32, for ``lane_maxima`` and ``lane_sum``; None without shared memory."""
 
 
-def pads_of(lanes: Lanes, nodes: Any, flow: Any = None) -> Pads:
-    """New pads of a block; ``flow`` where flowing matter occurs. Call it in ``ti.static``, once a group of threads."""
+def pads_of(lanes: Lanes, nodes: Any, flow: Any = None, whole: bool = False) -> Pads:
+    """New pads of a block; ``flow`` where flowing matter occurs; ``whole``: to add whole numbers to. Call it in
+    ``ti.static``, once a group of threads."""
     if not lanes.shared:
         past_window, past_scattered = (None, None) if flow is None else (flow.window, flow.scattered)
-        return Pads(nodes.window, nodes.scattered, past_window, past_scattered, None, None)
+        return Pads(nodes.window, nodes.scattered, past_window, past_scattered, None)
     shared = ti.simt.block.SharedArray
-    windows = [shared((4 * WINDOW_NODES,), ti.f32) for _ in range(2 if flow is None else 4)]
+    kinds = (ti.f32, ti.i32 if whole else ti.f32, *(() if flow is None else (ti.f32, ti.f32)))
+    windows = [shared((4 * PADDED_NODES,), kind) for kind in kinds]
     windows += [None] * (4 - len(windows))
     return reduction_pads(lanes)._replace(**dict(zip(Pads._fields, windows, strict=False)))
 
@@ -99,8 +126,7 @@ def pads_of(lanes: Lanes, nodes: Any, flow: Any = None) -> Pads:
 def reduction_pads(lanes: Lanes) -> Pads:
     """New pads for ``lane_maxima`` and ``lane_sum`` alone."""
     shared = ti.simt.block.SharedArray
-    maxima = shared((4 * lanes.threads,), ti.f32) if lanes.shared else None
-    return Pads(None, None, None, None, maxima, shared((lanes.threads,), ti.f32) if lanes.shared else None)
+    return Pads(None, None, None, None, shared((4 * lanes.warps,), ti.f32) if lanes.shared else None)
 
 
 def counters(lanes: Lanes) -> Any:
@@ -121,16 +147,16 @@ def lane_maxima(lanes: ti.template(), lane: ti.i32, values: vec4, pads: ti.templ
     result = values
     if ti.static(lanes.shared):
         for n in ti.static(range(4)):
-            pads.maxima[n * lanes.threads + lane] = values[n]
+            for half in ti.static(HALVES):
+                result[n] = ti.max(result[n], ti.simt.warp.shfl_down_f32(ti.u32(WHOLE_WARP), result[n], half))
+        if lane % WARP == 0:
+            for n in ti.static(range(4)):
+                pads.maxima[n * lanes.warps + lane // WARP] = result[n]
         ti.simt.block.sync()
-        for half in ti.static(lanes.halvings):
-            if lane < half:
-                for n in ti.static(range(4)):
-                    at = n * lanes.threads + lane
-                    pads.maxima[at] = ti.max(pads.maxima[at], pads.maxima[at + half])
-            ti.simt.block.sync()
         for n in ti.static(range(4)):
-            result[n] = pads.maxima[n * lanes.threads]
+            result[n] = pads.maxima[n * lanes.warps]
+            for other in ti.static(range(1, lanes.warps)):
+                result[n] = ti.max(result[n], pads.maxima[n * lanes.warps + other])
         ti.simt.block.sync()
     return result
 
@@ -140,12 +166,13 @@ def lane_sum(lanes: ti.template(), lane: ti.i32, value: ti.f32, pads: ti.templat
     """Sum over all lanes, for all of them."""
     result = value
     if ti.static(lanes.shared):
-        pads.sums[lane] = value
+        for half in ti.static(HALVES):
+            result += ti.simt.warp.shfl_down_f32(ti.u32(WHOLE_WARP), result, half)
+        if lane % WARP == 0:
+            pads.maxima[lane // WARP] = result
         ti.simt.block.sync()
-        for half in ti.static(lanes.halvings):
-            if lane < half:
-                pads.sums[lane] = pads.sums[lane] + pads.sums[lane + half]
-            ti.simt.block.sync()
-        result = pads.sums[0]
+        result = 0.0
+        for other in ti.static(range(lanes.warps)):
+            result += pads.maxima[other]
         ti.simt.block.sync()
     return result

@@ -17,7 +17,7 @@ import taichi as ti
 from .kernel_arrays import BlockTable, GridBlocks, ParticleBlocks, WorldArrays
 from .kernel_bundles import BundledKernel, func, kernel
 from .lanes import Lanes, counters, meet
-from .layout import Cells, Integers, Keys
+from .layout import FIXED_BITS, FIXED_LOW, Cells, Integers, Keys, ivec3
 from .sorting import block_key, home, key_block, key_field, neighbour_offset, rebase_particle, slot_of, wants_sort
 
 
@@ -118,10 +118,10 @@ def list_particle_blocks_in_parallel(
 
 @functools.cache
 def turn_counts_into_offsets_of(lanes: Lanes) -> BundledKernel:
-    """Kernel that replaces the counts of particles in ``blocks.starts`` by offsets, and copies these to ``cursors``."""
+    """Kernel that replaces the counts of particles in ``blocks.starts`` by offsets."""
 
     @kernel
-    def turn_counts_into_offsets(cursors: Integers, blocks: ParticleBlocks):
+    def turn_counts_into_offsets(blocks: ParticleBlocks):
         """A lane's part of the list starts with what the lanes before it hold."""
         if ti.static(lanes.shared):
             ti.loop_config(block_dim=ti.static(lanes.threads))
@@ -140,7 +140,6 @@ def turn_counts_into_offsets_of(lanes: Lanes) -> BundledKernel:
                 for other in range(lane):
                     total += before[0][other]
             for k in range(first, end):
-                cursors[k] = total
                 total += blocks.starts[k + 1]
                 blocks.starts[k + 1] = total
             if lane == 0:
@@ -161,8 +160,40 @@ def list_grid_blocks_in_parallel(
     return grid.starts[field_count]
 
 
+@func
+def cell_of(xi: ivec3):
+    """Number of the cell, of the 64 of its block, in which a particle lies that is at ``xi`` in the block's window."""
+    cell = 0
+    for n in ti.static(range(3)):
+        cell = cell * 4 + ti.min(ti.max(((xi[n] - FIXED_LOW) >> FIXED_BITS) - 1, 0), 3)
+    return cell
+
+
 @kernel
-def place_in_parallel(count: ti.i32, keys: Keys, cursors: Integers, targets: Integers, table: BlockTable):
-    """``sorting.place``: new index of every particle; those of a block in any order."""
+def place_in_turn(
+    count: ti.i32,
+    x: Cells,
+    keys: Keys,
+    counts: Integers,
+    targets: Integers,
+    table: BlockTable,
+    blocks: ParticleBlocks,
+):
+    """As ``sorting.place``, those of a block so that the cells take turns: one particle of each, then a second one of
+    each that has two, and so on. Lanes that run in step then hardly ever add to the same node.
+
+    x: positions in the blocks that ``keys`` name; counts: (P, 64) written over.
+    """
+    for c in range(blocks.count * 64):
+        counts[c] = 0
     for p in range(count):
-        targets[p] = ti.atomic_add(cursors[slot_of(keys[p], table)], 1)
+        targets[p] = ti.atomic_add(counts[slot_of(keys[p], table) * 64 + cell_of(x[p])], 1)
+    for p in range(count):
+        slot, own, turn = slot_of(keys[p], table), cell_of(x[p]), targets[p]
+        before = blocks.starts[slot]
+        for c in range(64):
+            others = counts[slot * 64 + c]
+            before += ti.min(others, turn)
+            if c < own and others > turn:
+                before += 1
+        targets[p] = before

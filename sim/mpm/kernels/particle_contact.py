@@ -51,7 +51,7 @@ from .kernel_arrays import (
     WorldArrays,
 )
 from .kernel_bundles import func
-from .lanes import lane_maxima, meet, pads_of
+from .lanes import NODE_THREADS, lane_maxima, meet, pads_of
 from .layout import (
     ADHESION_REACH,
     ADHESION_ROW,
@@ -94,7 +94,9 @@ from .windows import (
     add_to,
     clear_window,
     fetch_window,
+    first_of,
     gathered,
+    layer,
     load_window,
     node_of,
     store_window,
@@ -182,6 +184,7 @@ def press(
 @func
 def solve_block(
     lanes: ti.template(),
+    pushed: ti.template(),
     adheres: ti.template(),
     pads: ti.template(),
     lane: ti.i32,
@@ -212,8 +215,9 @@ def solve_block(
     if lane == 0:
         near.touched[k] = 0
         near.slack[k] = slack
-        for n in range(coupling.most_bodies * PUSH):
-            coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
+        if ti.static(pushed):
+            for n in range(coupling.most_bodies * PUSH):
+                coupling.pushes[s * coupling.most_bodies * PUSH + n] = 0.0
     if worlds.control[c + PHASE] == FULL and slack <= 0.0:
         # Particles farther away cannot touch in this substep.
         reach = REACH_FACTOR * fastest * dt + LEAST_REACH
@@ -246,21 +250,22 @@ def solve_block(
             obstacle, second_obstacle = 0, 0
             if has_plane:
                 phi = level + plane.dot(gp) - fixed[3]
-            for o in range(body_count):
-                farthest = MOST_SLACK + AHEAD * reach + fixed[3]
-                around = AHEAD * reach
-                if ti.static(adheres):
-                    farthest += MOST_REACH
-                    around = ti.max(around, adhesion.touches[(first_touch + o + 1) * ADHESION_ROW + ADHESION_REACH])
-                found, along, rate = body_distance(first_body + o, first_node + gp, farthest, bodies, shapes)
-                found -= fixed[3]
-                if found < around:
-                    coupling.pushes[(s * coupling.most_bodies + o) * PUSH + 6] += fixed[0]
-                if found < phi:
-                    second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
-                    phi, normal, swelling, obstacle = found, along, rate, o + 1
-                elif found < second:
-                    second, second_normal, second_swelling, second_obstacle = found, along, rate, o + 1
+            if ti.static(pushed):
+                for o in range(body_count):
+                    farthest = MOST_SLACK + AHEAD * reach + fixed[3]
+                    around = AHEAD * reach
+                    if ti.static(adheres):
+                        farthest += MOST_REACH
+                        around = ti.max(around, adhesion.touches[(first_touch + o + 1) * ADHESION_ROW + ADHESION_REACH])
+                    found, along, rate = body_distance(first_body + o, first_node + gp, farthest, bodies, shapes)
+                    found -= fixed[3]
+                    if found < around:
+                        coupling.pushes[(s * coupling.most_bodies + o) * PUSH + 6] += fixed[0]
+                    if found < phi:
+                        second, second_normal, second_swelling, second_obstacle = phi, normal, swelling, obstacle
+                        phi, normal, swelling, obstacle = found, along, rate, o + 1
+                    elif found < second:
+                        second, second_normal, second_swelling, second_obstacle = found, along, rate, o + 1
             pinned = False
             if has_anchors:
                 pinned = particles.anchors[p][3] == PIN
@@ -279,10 +284,11 @@ def solve_block(
                 base = ti.cast(gp - 0.5, ti.i32)
                 fx = gp - ti.cast(base, ti.f32)
                 w3 = weights(fx)
-                inside = base[0] * 64 + base[1] * 8 + base[2]
+                inside = first_of(base, pads.window)
                 u = vec4(0.0)
                 for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                    u += (w3[i][0] * w3[j][1] * w3[m][2]) * node_of(pads.window, spot + inside + (i * 64 + j * 8 + m))
+                    n = spot + inside + (i * ti.static(layer(pads.window)) + j * 8 + m)
+                    u += (w3[i][0] * w3[j][1] * w3[m][2]) * node_of(pads.window, n)
                 share = 1.0
                 if old.norm_sqr() > 0.0 and past[3] > 0.0:
                     share = ti.max(past[3], 0.02)
@@ -299,12 +305,13 @@ def solve_block(
                 else:
                     surface = swelling * normal
                     give = 0.0
-                    if obstacle > 0:
-                        i = first_body + obstacle - 1
-                        surface += body_velocity(i, here, bodies)
-                        local = here - single3(bodies.state, i * STATE + X)
-                        surface += surface_slide(i, local, normal, bodies, shapes)
-                        give = coupling.touching[i] * body_compliance(i, here, normal, bodies)
+                    if ti.static(pushed):
+                        if obstacle > 0:
+                            i = first_body + obstacle - 1
+                            surface += body_velocity(i, here, bodies)
+                            local = here - single3(bodies.state, i * STATE + X)
+                            surface += surface_slide(i, local, normal, bodies, shapes)
+                            give = coupling.touching[i] * body_compliance(i, here, normal, bodies)
                     pull = 0.0
                     if ti.static(adheres):
                         pull = largest_pull(first_touch + obstacle, phi, dt, adhesion.touches, adhesion.touch_sums)
@@ -323,8 +330,9 @@ def solve_block(
                     )
                     if second < reach:
                         surface = second_swelling * second_normal
-                        if second_obstacle > 0:
-                            surface += body_velocity(first_body + second_obstacle - 1, here, bodies)
+                        if ti.static(pushed):
+                            if second_obstacle > 0:
+                                surface += body_velocity(first_body + second_obstacle - 1, here, bodies)
                         left = (velocity + share * (new - old) - surface).dot(second_normal)
                         wanted = parting_speed(second, dt, recovery)
                         beside = (ti.max(0.0, wanted - left) / (share + give)) * second_normal
@@ -334,16 +342,16 @@ def solve_block(
                     mass = ti.select((new + beside).norm_sqr() > 0.0, fixed[0], 0.0)
                     q = vec4(change[0], change[1], change[2], mass)
                     for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                        add_to(
-                            pads.scattered, offset + inside + (i * 64 + j * 8 + m), (w3[i][0] * w3[j][1] * w3[m][2]) * q
-                        )
-                    if obstacle > 0 and not pinned:
-                        row = (s * coupling.most_bodies + obstacle - 1) * PUSH
-                        add_push(first_body + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
-                    if second_obstacle > 0 and beside.norm_sqr() > 0.0:
-                        row = (s * coupling.most_bodies + second_obstacle - 1) * PUSH
-                        given = -fixed[0] * beside
-                        add_push(first_body + second_obstacle - 1, row, here, given, bodies, coupling)
+                        n = offset + inside + (i * ti.static(layer(pads.scattered)) + j * 8 + m)
+                        add_to(pads.scattered, n, (w3[i][0] * w3[j][1] * w3[m][2]) * q)
+                    if ti.static(pushed):
+                        if obstacle > 0 and not pinned:
+                            row = (s * coupling.most_bodies + obstacle - 1) * PUSH
+                            add_push(first_body + obstacle - 1, row, here, -fixed[0] * new, bodies, coupling)
+                        if second_obstacle > 0 and beside.norm_sqr() > 0.0:
+                            row = (s * coupling.most_bodies + second_obstacle - 1) * PUSH
+                            given = -fixed[0] * beside
+                            add_push(first_body + second_obstacle - 1, row, here, given, bodies, coupling)
             p += ti.static(lanes.threads)
         meet(lanes)
         most = lane_maxima(lanes, lane, vec4(touched, -least, 0.0, 0.0), pads)
@@ -358,6 +366,7 @@ def solve_block(
 @func
 def solve_contact(
     lanes: ti.template(),
+    pushed: ti.template(),
     adheres: ti.template(),
     worlds: WorldArrays,
     blocks: ParticleBlocks,
@@ -371,22 +380,22 @@ def solve_contact(
 ):
     """One Jacobi sweep: update ``reaction`` (cells/s^2) and scatter the change of impulse and the contacting mass.
 
+    pushed: whether there are rigid bodies or colliders.
     adheres: whether some fields adhere to rigid bodies or colliders.
     """
     if ti.static(lanes.shared):
         ti.loop_config(block_dim=ti.static(lanes.threads))
-    for ss in range(turns(lanes, near.particle_count, nodes.window) * ti.static(lanes.span)):
-        lane = ss % ti.static(lanes.span)
-        if lane < ti.static(lanes.threads):
-            turn, all_turns = ss // ti.static(lanes.span), turns(lanes, near.particle_count, nodes.window)
+        for ss in range(ti.static(lanes.groups * lanes.threads)):
             pads = ti.static(pads_of(lanes, nodes))
-            if ti.static(lanes.shared):
+            s = ss // ti.static(lanes.threads)
+            while s < near.particle_count:
                 solve_block(
                     lanes,
+                    pushed,
                     adheres,
                     pads,
-                    lane,
-                    turn,
+                    ss % ti.static(lanes.threads),
+                    s,
                     0,
                     worlds,
                     blocks,
@@ -398,11 +407,18 @@ def solve_contact(
                     coupling,
                     adhesion,
                 )
-            else:
+                s += ti.static(lanes.groups)
+    else:
+        for ss in range(turns(lanes, near.particle_count, nodes.window) * ti.static(lanes.span)):
+            lane = ss % ti.static(lanes.span)
+            if lane < ti.static(lanes.threads):
+                turn, all_turns = ss // ti.static(lanes.span), turns(lanes, near.particle_count, nodes.window)
+                pads = ti.static(pads_of(lanes, nodes))
                 for s in range(turn * near.particle_count // all_turns, (turn + 1) * near.particle_count // all_turns):
                     spot = turn * WINDOW_NODES
                     solve_block(
                         lanes,
+                        pushed,
                         adheres,
                         pads,
                         lane,
@@ -421,17 +437,29 @@ def solve_contact(
 
 
 @func
+def apply_to_node(t: ti.i32, worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
+    """``apply_contact`` at node ``t`` of the near blocks."""
+    g = near.grid_blocks[t // BLOCK_NODES]
+    n = g * BLOCK_NODES + t % BLOCK_NODES
+    w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+    if worlds.control[w * CONTROL_ROW + PHASE] == FULL and nodes.mass[n] > 0.0:
+        q = gathered(g, t % BLOCK_NODES, grid.neighbours, near.touched, nodes.scattered) / nodes.mass[n]
+        u = nodes.velocity[n]
+        nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+
+
+@func
 def apply_contact(lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
     """Add the change of impulse to the nodes' velocity; leave the share of contacting mass in their fourth number."""
-    if ti.static(lanes.parallel):
+    if ti.static(lanes.shared):
+        for start in range(NODE_THREADS):
+            t = start
+            while t < near.grid_count * BLOCK_NODES:
+                apply_to_node(t, worlds, grid, near, nodes)
+                t += NODE_THREADS
+    elif ti.static(lanes.parallel):
         for t in range(near.grid_count * BLOCK_NODES):
-            g = near.grid_blocks[t // BLOCK_NODES]
-            n = g * BLOCK_NODES + t % BLOCK_NODES
-            w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
-            if worlds.control[w * CONTROL_ROW + PHASE] == FULL and nodes.mass[n] > 0.0:
-                q = gathered(g, t % BLOCK_NODES, grid.neighbours, near.touched, nodes.scattered) / nodes.mass[n]
-                u = nodes.velocity[n]
-                nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+            apply_to_node(t, worlds, grid, near, nodes)
     else:
         for ss in range(near.grid_count * SPREAD):
             if ss % SPREAD == 0:

@@ -10,7 +10,8 @@ kilograms. A substep is
 
     advance_nodes      gather the windows, momentum -> velocity, forces: ``grid``
     contact            of deformable bodies: ``deformable_contact``; with plane, bodies, colliders: ``particle_contact``
-    advance_particles  grid -> particles -> grid in one pass over the particles, on the CPU without atomics
+    advance_particles  grid -> particles -> grid in one pass over the particles, on the CPU without atomics:
+                       ``whole_transfer``, and for a block on the CPU ``advance_block`` here
 """
 
 import taichi as ti
@@ -20,7 +21,7 @@ from .constitutive_response import flows as material_flows
 from .crowding import RELAXED, STIFFNESS, load_crowding, part_crowd
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
-from .lanes import lane_maxima, lane_sum, meet, pads_of
+from .lanes import lane_maxima, lane_sum, meet
 from .layout import (
     CONTROL_ROW,
     ELAPSED,
@@ -64,13 +65,13 @@ from .layout import (
 from .windows import (
     clear_window,
     fetch_window,
+    first_of,
     interpolate,
     interpolate_curved,
     load_window,
     spread,
     spread_kept,
     store_window,
-    turns,
 )
 
 PIN, GOAL = 1.0, 2.0
@@ -158,7 +159,10 @@ def advance_block(
     flow: FlowArrays,
     nodes: NodeArrays,
 ):
-    """``advance_particles`` of block ``k``, whose windows to read begin at ``spot`` of their arrays."""
+    """``advance_particles`` of block ``k``, whose windows to read begin at ``spot`` of their arrays.
+
+    ``whole_transfer.advance_block_in_whole_numbers`` does the same on a card; what is changed here belongs there, too.
+    """
     offset = 0 if ti.static(lanes.shared) else k * WINDOW_NODES
     crowd_spot = k * WINDOW_NODES if ti.static(lanes.shared) else spot
     f = blocks.field[k]
@@ -232,7 +236,7 @@ def advance_block(
             gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
             base = ti.cast(gp - 0.5, ti.i32)
             fx = gp - ti.cast(base, ti.f32)
-            first = spot + base[0] * 64 + base[1] * 8 + base[2]
+            first = spot + first_of(base, pads.window)
             A, B0, B1, B2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
             if ti.static(not laws.flowing):
                 A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
@@ -269,7 +273,7 @@ def advance_block(
                     if ti.static(len(laws.volumetric) > 0):
                         if crowds and scatter:
                             strength = dt_gather * STIFFNESS * sound2 * fixed[0]
-                            known = first - spot + crowd_spot
+                            known = crowd_spot + base[0] * 64 + base[1] * 8 + base[2]
                             crowding, given = part_crowd(
                                 known, first - spot + offset, fx, strength, flow.crowding_window, pads.scattered
                             )
@@ -327,7 +331,7 @@ def advance_block(
             gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
             base = ti.cast(gp - 0.5, ti.i32)
             fx = gp - ti.cast(base, ti.f32)
-            first = offset + base[0] * 64 + base[1] * 8 + base[2]
+            first = offset + first_of(base, pads.scattered)
             if touching:
                 # Start the contact solve from the forces of the last substep.
                 a = particles.reaction[p]
@@ -378,40 +382,3 @@ def advance_block(
             blocks.report[r + 4] = sum2
         if scatter:
             blocks.report[r + 1] = stiffness
-
-
-@func
-def advance_particles(
-    laws: ti.template(),
-    lanes: ti.template(),
-    worlds: WorldArrays,
-    blocks: ParticleBlocks,
-    near: NearBlocks,
-    particles: ParticleArrays,
-    nodes: NodeArrays,
-    flow: FlowArrays,
-):
-    """Grid to particles over ``STEP``, then particles to grid with the stress impulse of ``NEXT_STEP``.
-
-    laws: the models that occur, a ``LawSet``; of ``only_elastic`` ones neither ``material`` nor ``memory`` is read.
-    lanes: threads that share a block, a ``Lanes``.
-    The world's phase leaves the first half out (after a sort), its SCATTER the second (before one); STORE writes ``v``
-    and ``C``, which are otherwise recomputed before they are read.
-
-    Granular and fluid materials store ``v`` and ``C`` every substep, to keep what the grid cannot carry. They still
-    move with the grid's velocity, so contacts hold as for all materials. Solids carry second derivatives of the
-    velocity instead, in registers: they are dropped at a sort, and take no memory.
-    """
-    if ti.static(lanes.shared):
-        ti.loop_config(block_dim=ti.static(lanes.threads))
-    for kk in range(turns(lanes, blocks.count, nodes.window) * ti.static(lanes.span)):
-        lane = kk % ti.static(lanes.span)
-        if lane < ti.static(lanes.threads):
-            turn, all_turns = kk // ti.static(lanes.span), turns(lanes, blocks.count, nodes.window)
-            pads = ti.static(pads_of(lanes, nodes, flow if laws.flowing else None))
-            if ti.static(lanes.shared):
-                advance_block(laws, lanes, pads, lane, turn, 0, worlds, blocks, near, particles, flow, nodes)
-            else:
-                for k in range(turn * blocks.count // all_turns, (turn + 1) * blocks.count // all_turns):
-                    spot = turn * WINDOW_NODES
-                    advance_block(laws, lanes, pads, lane, k, spot, worlds, blocks, near, particles, flow, nodes)

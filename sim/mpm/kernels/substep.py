@@ -41,27 +41,27 @@ from .kernel_arrays import (
     StepLimits,
     WorldArrays,
 )
-from .kernel_bundles import BundledKernel, Launcher, kernel
+from .kernel_bundles import BundledKernel, Launcher, kernel, merged
 from .lanes import Lanes
 from .layout import CONTROL_ROW, FULL, PHASE, STEP, Integers
 from .particle_contact import apply_contact, solve_contact
-from .particle_transfer import advance_particles
 from .time_stepping import forget_reports, review, review_in_parallel, settle
+from .whole_transfer import advance_particles
 
 
 @functools.cache
-def advance_grid_of(flowing: bool, parallel: bool, means: bool) -> BundledKernel:
-    """Kernel of grid nodes; ``flowing``: some materials are granular or fluid; ``parallel``: a thread a node;
-    ``means``: some fields' means are wanted."""
+def advance_grid_of(flowing: bool, lanes: Lanes, means: bool) -> BundledKernel:
+    """Kernel of grid nodes; ``flowing``: some materials are granular or fluid; ``means``: some fields' means are
+    wanted."""
 
     @kernel
     def advance_grid(worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays):
         """Nodes over STEP; ``mean_fields`` is 0 where no body's means are wanted."""
-        if ti.static(parallel):
-            advance_nodes_in_parallel(flowing, means, worlds, grid, nodes, flow)
+        if ti.static(lanes.parallel):
+            advance_nodes_in_parallel(flowing, means, lanes, worlds, grid, nodes, flow)
         else:
             advance_nodes(flowing, worlds, grid, nodes, flow)
-        if ti.static(means or not parallel):
+        if ti.static(means or not lanes.parallel):
             gather_means(worlds, grid, nodes)
 
     return advance_grid
@@ -150,7 +150,11 @@ def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool, adheres: bool) -
         """Contact impulses between particles and plane, rigid bodies, colliders and pins."""
         if ti.static(adheres):
             sum_reached(worlds, blocks, near, particles, bodies, shapes, adhesion)
-        solve_contact(lanes, adheres, worlds, blocks, near, particles, nodes, bodies, shapes, coupling, adhesion)
+        # The serial kernel finds by itself that there are none.
+        any_bodies = ti.static(pushed or not lanes.parallel)
+        solve_contact(
+            lanes, any_bodies, adheres, worlds, blocks, near, particles, nodes, bodies, shapes, coupling, adhesion
+        )
         apply_contact(lanes, worlds, grid, near, nodes)
         if ti.static(lanes.parallel and pushed):
             gather_pushes_in_parallel(worlds, blocks, near, bodies, coupling)
@@ -165,8 +169,9 @@ def resolve_contact_of(lanes: Lanes, pushed: bool, fluid: bool, adheres: bool) -
 
 
 @functools.cache
-def advance_matter_of(laws: int, lanes: Lanes) -> BundledKernel:
-    """Kernel of particles for the set ``laws`` of constitutive models; one is compiled for each set."""
+def advance_matter_of(laws: int, lanes: Lanes, pushed: bool = True) -> BundledKernel:
+    """Kernel of particles for the set ``laws`` of constitutive models; one is compiled for each set. pushed: there are
+    rigid bodies or colliders."""
     models = law_set(laws)
 
     @kernel
@@ -185,7 +190,7 @@ def advance_matter_of(laws: int, lanes: Lanes) -> BundledKernel:
         many threads [w] whether world w does."""
         advance_particles(models, lanes, worlds, blocks, near, particles, nodes, flow)
         if ti.static(lanes.parallel):
-            review_in_parallel(lanes, running, limits, worlds, blocks, bodies)
+            review_in_parallel(lanes, pushed, running, limits, worlds, blocks, bodies)
         else:
             running[0] = review(limits, worlds, blocks, bodies)
 
@@ -217,7 +222,7 @@ def substep_launcher(
     particles are near the plane, a body or a collider, or are held.
     """
     # The serial kernels leave out by themselves what is not there; compiling them twice would cost more.
-    kernels = [advance_grid_of(law_set(laws).flowing, lanes.parallel, means and lanes.parallel)]
+    kernels = [advance_grid_of(law_set(laws).flowing, lanes, means and lanes.parallel)]
     if overlap:
         kernels.append(part_bodies_of(laws, lanes, thin, adheres))
     fluid = bool(law_set(laws).volumetric)
@@ -229,7 +234,10 @@ def substep_launcher(
         kernels.append(resolve_contact_of(lanes, bodies and lanes.parallel, fluid, adheres and bodies))
     if bodies:
         kernels += rigid_substep(together=together)
-    kernels.append(advance_matter_of(laws, lanes))
+    kernels.append(advance_matter_of(laws, lanes, bodies or not lanes.parallel))
+    if lanes.parallel:
+        # A launch for each kernel of the rigid bodies' is dear, too, but the compiler takes too long for one of all.
+        kernels = [each.lean() for each in ([merged(kernels)] if not bodies else kernels)]
     return Launcher(kernels, repeats=REPEATS)
 
 
@@ -239,7 +247,7 @@ def review_bodies(running: Integers, limits: StepLimits, worlds: WorldArrays, bo
     going_on = 0
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
-        forget_reports(w, worlds, bodies)
+        forget_reports(True, w, worlds, bodies)
         going_on += settle(w, limits, worlds)
     running[0] = going_on
 

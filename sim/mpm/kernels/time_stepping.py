@@ -68,6 +68,9 @@ MOST_RIGID_DRIFT = 1.0
 RIGID_LOST = 1_000_000
 """LOST_FIELD of a world in which rigid body i diverged is this plus i."""
 
+REVIEWERS = 64
+"""Groups of threads of a card that take worlds in turn."""
+
 FARTHEST_STEP = 0.9
 """Cells that a particle may move in a substep; more is cut off by its window, and the substep counts as diverged."""
 
@@ -122,7 +125,7 @@ def plan(c: ti.i32, limits: StepLimits, worlds: WorldArrays):
 
 
 @func
-def forget_reports(w: ti.i32, worlds: WorldArrays, bodies: RigidArrays):
+def forget_reports(pushed: ti.template(), w: ti.i32, worlds: WorldArrays, bodies: RigidArrays):
     """Reset the maxima before the blocks' reports are gathered; start from the solids' speeds."""
     c = w * CONTROL_ROW
     if worlds.control[c + PHASE] == FULL:
@@ -130,15 +133,16 @@ def forget_reports(w: ti.i32, worlds: WorldArrays, bodies: RigidArrays):
         worlds.control[c + MARGIN] = 1e9
         worlds.control[c + FASTEST_FIELD] = -1.0
     worlds.control[c + RIGID_SPEED] = 0.0
-    first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
-    for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
-        kind = bodies.kinds[i * KINDS + KIND]
-        if kind == DYNAMIC or kind == KINEMATIC:
-            turning = load3(bodies.state, i * STATE + W).norm() * bodies.numbers[i * NUMBERS + RADIUS]
-            speed = load3(bodies.state, i * STATE + V).norm() + turning
-            if double_not_finite(speed):
-                lose(c, RIGID_LOST + i, worlds)
-            worlds.control[c + RIGID_SPEED] = ti.max(worlds.control[c + RIGID_SPEED], speed)
+    if ti.static(pushed):
+        first = worlds.integers[w * WORLD_INTEGERS + FIRST_RIGID_BODY]
+        for i in range(first, first + worlds.integers[w * WORLD_INTEGERS + RIGID_BODIES]):
+            kind = bodies.kinds[i * KINDS + KIND]
+            if kind == DYNAMIC or kind == KINEMATIC:
+                turning = load3(bodies.state, i * STATE + W).norm() * bodies.numbers[i * NUMBERS + RADIUS]
+                speed = load3(bodies.state, i * STATE + V).norm() + turning
+                if double_not_finite(speed):
+                    lose(c, RIGID_LOST + i, worlds)
+                worlds.control[c + RIGID_SPEED] = ti.max(worlds.control[c + RIGID_SPEED], speed)
     if worlds.control[c + PHASE] != IDLE and worlds.control[c + SCATTER] == 1.0:
         worlds.control[c + WAVE_SPEED] = 0.0
 
@@ -194,7 +198,7 @@ def review(limits: StepLimits, worlds: WorldArrays, blocks: ParticleBlocks, bodi
     """
     ti.loop_config(serialize=True)
     for w in range(worlds.count):
-        forget_reports(w, worlds, bodies)
+        forget_reports(True, w, worlds, bodies)
     ti.loop_config(serialize=True)
     for k in range(blocks.count):
         c = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD] * CONTROL_ROW
@@ -223,6 +227,7 @@ def review(limits: StepLimits, worlds: WorldArrays, blocks: ParticleBlocks, bodi
 @func
 def review_in_parallel(
     lanes: ti.template(),
+    pushed: ti.template(),
     running: Integers,
     limits: StepLimits,
     worlds: WorldArrays,
@@ -230,45 +235,70 @@ def review_in_parallel(
     bodies: RigidArrays,
 ):
     """As ``review``, with a group of threads for each world. Sets ``running[w]`` to whether world w needs another
-    substep."""
+    substep. pushed: whether there are rigid bodies or colliders."""
     if ti.static(lanes.shared):
         ti.loop_config(block_dim=ti.static(lanes.threads))
-    for t in range(worlds.count * ti.static(lanes.threads)):
-        w, lane = t // ti.static(lanes.threads), t % ti.static(lanes.threads)
-        pads = ti.static(reduction_pads(lanes))
-        c = w * CONTROL_ROW
-        if lane == 0:
-            forget_reports(w, worlds, bodies)
-        meet(lanes)
-        moved = worlds.control[c + PHASE] == FULL
-        scattered = worlds.control[c + PHASE] != IDLE and worlds.control[c + SCATTER] == 1.0
-        speed2, wave2, margin, fastest = -1.0, 0.0, 1e9, -1
-        k = lane
-        while k < blocks.count:
-            if worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD] == w:
-                r = k * SCALARS_PER_BLOCK
-                if moved:
-                    if blocks.report[r] > speed2:
-                        speed2, fastest = blocks.report[r], blocks.field[k]
-                    margin = ti.min(margin, blocks.report[r + 2])
-                    if not_finite(blocks.report[r + 4]):
-                        lose(c, blocks.field[k], worlds)
-                if scattered:
-                    wave2 = ti.max(wave2, blocks.report[r + 1])
-                    if not_finite(blocks.report[r + 1]):
-                        lose(c, blocks.field[k], worlds)
-            k += ti.static(lanes.threads)
-        most = lane_maxima(lanes, lane, vec4(speed2, wave2, -margin, 0.0), pads)
-        if moved and fastest >= 0 and speed2 == most[0]:
-            worlds.control[c + FASTEST_FIELD] = fastest
-        meet(lanes)
-        if lane == 0:
+        for t in range(ti.static(REVIEWERS * lanes.threads)):
+            pads = ti.static(reduction_pads(lanes))
+            w = t // ti.static(lanes.threads)
+            while w < worlds.count:
+                lane = t % ti.static(lanes.threads)
+                review_world(lanes, pushed, pads, lane, w, running, limits, worlds, blocks, bodies)
+                w += REVIEWERS
+    else:
+        for w in range(worlds.count):
+            pads = ti.static(reduction_pads(lanes))
+            review_world(lanes, pushed, pads, 0, w, running, limits, worlds, blocks, bodies)
+
+
+@func
+def review_world(
+    lanes: ti.template(),
+    pushed: ti.template(),
+    pads: ti.template(),
+    lane: ti.i32,
+    w: ti.i32,
+    running: Integers,
+    limits: StepLimits,
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    bodies: RigidArrays,
+):
+    """``review_in_parallel`` of world ``w``."""
+    c = w * CONTROL_ROW
+    if lane == 0:
+        forget_reports(pushed, w, worlds, bodies)
+    meet(lanes)
+    moved = worlds.control[c + PHASE] == FULL
+    scattered = worlds.control[c + PHASE] != IDLE and worlds.control[c + SCATTER] == 1.0
+    speed2, wave2, margin, fastest = -1.0, 0.0, 1e9, -1
+    k = lane
+    while k < blocks.count:
+        if worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + WORLD] == w:
+            r = k * SCALARS_PER_BLOCK
             if moved:
-                worlds.control[c + SPEED] = ti.max(0.0, most[0])
-                worlds.control[c + MARGIN] = -most[2]
+                if blocks.report[r] > speed2:
+                    speed2, fastest = blocks.report[r], blocks.field[k]
+                margin = ti.min(margin, blocks.report[r + 2])
+                if not_finite(blocks.report[r + 4]):
+                    lose(c, blocks.field[k], worlds)
             if scattered:
-                worlds.control[c + WAVE_SPEED] = most[1]
-            running[w] = settle(w, limits, worlds)
+                wave2 = ti.max(wave2, blocks.report[r + 1])
+                if not_finite(blocks.report[r + 1]):
+                    lose(c, blocks.field[k], worlds)
+        k += ti.static(lanes.threads)
+    most = lane_maxima(lanes, lane, vec4(speed2, wave2, -margin, 0.0), pads)
+    if moved and fastest >= 0 and speed2 == most[0]:
+        worlds.control[c + FASTEST_FIELD] = fastest
+    meet(lanes)
+    if lane == 0:
+        if moved:
+            worlds.control[c + SPEED] = ti.max(0.0, most[0])
+            worlds.control[c + MARGIN] = -most[2]
+        if scattered:
+            worlds.control[c + WAVE_SPEED] = most[1]
+        running[w] = settle(w, limits, worlds)
+    meet(lanes)
 
 
 @func

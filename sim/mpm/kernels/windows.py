@@ -6,23 +6,55 @@
 
 Quadratic B-splines; APIC (Jiang et al. 2015) with second derivatives for solids (PolyPIC, Fu et al. 2017). A block of
 particles owns a window of nodes to write (see ``layout``) and borrows one to read. Where many lanes share a block both
-lie in shared memory, component by component; ``node_of``, ``set_node`` and ``add_to`` hide that.
+lie in shared memory, component by component, with padding between layers (``layer``, ``first_of``, ``in_window``); that
+to write holds whole numbers, except for fluids. ``node_of``, ``set_node`` and ``add_to`` hide that.
 """
 
 from typing import Any
 
 import taichi as ti
 
-from .layout import BLOCK_NODES, WINDOW_NODES, Integers, Vectors4, vec3, vec4
+from .lanes import PADDED, PADDED_NODES
+from .layout import BLOCK_NODES, WINDOW, WINDOW_NODES, Integers, Vectors4, ivec3, mat3, vec3, vec4
 
 CURVED = 0.95
 """Share of the second derivatives of the velocity around a particle of a solid that it carries from substep to substep
 (PolyPIC, Fu et al. 2017). 0 is plain APIC; 1 would damp third derivatives only, and keep noise of one cell for long."""
 
 
+MOST_SUM = 2.0**30
+"""Largest whole number to which the particles of a block may add up at a node."""
+
+LARGEST_WEIGHT = 0.75**3
+"""Largest weight of a particle at a node."""
+
+LEAST_LARGEST = 1e-20
+"""What is smaller (kg cells/s, kg) counts as nothing where windows are summed in whole numbers."""
+
+
 def is_shared(window: Any) -> bool:
     """Whether ``window`` lies in shared memory."""
     return isinstance(window, ti.simt.block.SharedArray)
+
+
+def is_whole(window: Any) -> bool:
+    """Whether ``window`` lies in shared memory and holds whole numbers."""
+    return is_shared(window) and window.dtype == ti.i32
+
+
+def layer(window: Any) -> int:
+    """Nodes from one layer of a window to the next."""
+    return PADDED if is_shared(window) else WINDOW * WINDOW
+
+
+@ti.func
+def first_of(base: ti.template(), window: ti.template()):
+    """Index in ``window`` of its node at ``base``, three whole numbers from 0 to 5."""
+    node = ivec3(base[0], base[1], base[2])
+    if ti.static(is_shared(window)):
+        # Beyond shared memory lies an error of the whole card; elsewhere another block's window.
+        node = ti.min(ti.max(node, 0), WINDOW - 3)
+    return node[0] * ti.static(layer(window)) + node[1] * 8 + node[2]
 
 
 def is_given(argument: Any) -> bool:
@@ -31,12 +63,21 @@ def is_given(argument: Any) -> bool:
 
 
 @ti.func
+def in_window(n: ti.i32, window: ti.template()):
+    """Place in ``window`` of its node ``n``."""
+    place = n
+    if ti.static(is_shared(window)):
+        place += (n >> 6) * ti.static(PADDED - WINDOW * WINDOW)
+    return place
+
+
+@ti.func
 def node_of(window: ti.template(), n: ti.i32):
     """The four numbers of a node of a window."""
     node = vec4(0.0)
     if ti.static(is_shared(window)):
         for c in ti.static(range(4)):
-            node[c] = window[c * WINDOW_NODES + n]
+            node[c] = ti.cast(window[c * PADDED_NODES + n], ti.f32)
     else:
         node = window[n]
     return node
@@ -47,17 +88,33 @@ def set_node(window: ti.template(), n: ti.i32, node: vec4):
     """Set the four numbers of a node of a window."""
     if ti.static(is_shared(window)):
         for c in ti.static(range(4)):
-            window[c * WINDOW_NODES + n] = node[c]
+            if ti.static(is_whole(window)):
+                window[c * PADDED_NODES + n] = ti.floor(node[c] + 0.5, ti.i32)
+            else:
+                window[c * PADDED_NODES + n] = node[c]
     else:
         window[n] = node
 
 
 @ti.func
+def add_whole(window: ti.template(), n: ti.i32, share: vec4):
+    """Add ``share``, rounded, to a node of a window of whole numbers; what rounding has left of it."""
+    left = share
+    for c in ti.static(range(4)):
+        nearest = ti.floor(share[c] + 0.5, ti.i32)
+        left[c] -= ti.cast(nearest, ti.f32)
+        ti.atomic_add(window[c * PADDED_NODES + n], nearest)
+    return left
+
+
+@ti.func
 def add_to(window: ti.template(), n: ti.i32, share: vec4):
     """Add to a node of a window: in shared memory atomically, elsewhere one thread owns the window."""
-    if ti.static(is_shared(window)):
+    if ti.static(is_whole(window)):
+        add_whole(window, n, share)
+    elif ti.static(is_shared(window)):
         for c in ti.static(range(4)):
-            ti.atomic_add(window[c * WINDOW_NODES + n], share[c])
+            ti.atomic_add(window[c * PADDED_NODES + n], share[c])
     else:
         window[n] = window[n] + share
 
@@ -67,17 +124,30 @@ def clear_window(lanes: ti.template(), lane: ti.i32, offset: ti.i32, window: ti.
     """Set a window to zero."""
     i = lane
     while i < WINDOW_NODES:
-        set_node(window, offset + i, vec4(0.0))
+        set_node(window, offset + in_window(i, window), vec4(0.0))
         i += ti.static(lanes.threads)
 
 
 @ti.func
-def store_window(lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.template(), array: Vectors4):
-    """Copy block ``k``'s window from shared memory to its place in ``array``; without shared memory it is there."""
+def scale_window(lanes: ti.template(), lane: ti.i32, factor: vec4, window: ti.template()):
+    """Multiply the nodes of a window by ``factor``, each number by its own."""
+    i = lane
+    while i < WINDOW_NODES:
+        n = in_window(i, window)
+        set_node(window, n, node_of(window, n) * factor)
+        i += ti.static(lanes.threads)
+
+
+@ti.func
+def store_window(
+    lanes: ti.template(), lane: ti.i32, k: ti.i32, window: ti.template(), array: Vectors4, unit: ti.template() = 1.0
+):
+    """Copy block ``k``'s window, whose numbers count ``unit``, from shared memory to its place in ``array``; without
+    shared memory it is there."""
     if ti.static(lanes.shared):
         i = lane
         while i < WINDOW_NODES:
-            array[k * WINDOW_NODES + i] = node_of(window, i)
+            array[k * WINDOW_NODES + i] = node_of(window, in_window(i, window)) * unit
             i += ti.static(lanes.threads)
 
 
@@ -114,7 +184,7 @@ def fetch_window(
     many lanes."""
     n = lane
     while n < WINDOW_NODES:
-        set_node(window, spot + n, nodes[grid_node(k, n, neighbours)])
+        set_node(window, spot + in_window(n, window), nodes[grid_node(k, n, neighbours)])
         n += ti.static(lanes.threads)
 
 
@@ -228,7 +298,7 @@ def interpolate(first: ti.i32, fx: vec3, window: ti.template()):
             Aj = vec4(0.0)
             B2j = vec4(0.0)
             for m in ti.static(range(3)):
-                u = node_of(window, first + (i * 64 + j * 8 + m)) * w[m][2]
+                u = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + m)) * w[m][2]
                 Aj += u
                 if ti.static(m > 0):
                     B2j += float(m) * u
@@ -267,9 +337,9 @@ def interpolate_curved(first: ti.i32, fx: vec3, window: ti.template()):
         D1i = vec4(0.0)
         D2i = vec4(0.0)
         for j in ti.static(range(3)):
-            u0 = node_of(window, first + (i * 64 + j * 8))
-            u1 = node_of(window, first + (i * 64 + j * 8 + 1))
-            u2 = node_of(window, first + (i * 64 + j * 8 + 2))
+            u0 = node_of(window, first + (i * ti.static(layer(window)) + j * 8))
+            u1 = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + 1))
+            u2 = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + 2))
             v1 = w[1][2] * u1
             v2 = w[2][2] * u2
             Aj = w[0][2] * u0 + v1 + v2
@@ -327,6 +397,8 @@ def spread_curved(
     """As ``spread``, with ij e01 + im e02 + jm e12 more, and along each axis a mode (1, -2, 1) d that carries neither
     momentum nor angular momentum."""
     w = weights(fx)
+    # Where whole numbers are added, a node gets what rounding has left at the one before: the sum is the particle's.
+    left = vec4(0.0)
     for i in ti.static(range(3)):
         bi = b4 + float(i) * c0
         c1i = c1 + float(i) * e01
@@ -344,10 +416,15 @@ def spread_curved(
                 bj += w[i][0] * d1
             cj = wij * (c2i + float(j) * e12)
             dj = wij * d2
-            n = first + (i * 64 + j * 8)
-            add_to(window, n, w[0][2] * bj + dj)
-            add_to(window, n + 1, w[1][2] * (bj + cj) - 2.0 * dj)
-            add_to(window, n + 2, w[2][2] * (bj + 2.0 * cj) + dj)
+            n = first + (i * ti.static(layer(window)) + j * 8)
+            if ti.static(is_whole(window)):
+                left = add_whole(window, n, left + w[0][2] * bj + dj)
+                left = add_whole(window, n + 1, left + w[1][2] * (bj + cj) - 2.0 * dj)
+                left = add_whole(window, n + 2, left + w[2][2] * (bj + 2.0 * cj) + dj)
+            else:
+                add_to(window, n, w[0][2] * bj + dj)
+                add_to(window, n + 1, w[1][2] * (bj + cj) - 2.0 * dj)
+                add_to(window, n + 2, w[2][2] * (bj + 2.0 * cj) + dj)
 
 
 @ti.func
@@ -389,6 +466,7 @@ def spread_kept(
 def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, window: ti.template()):
     """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
     w = weights(fx)
+    left = vec4(0.0)
     for i in ti.static(range(3)):
         bi = b4 + float(i) * c0
         for j in ti.static(range(3)):
@@ -396,4 +474,22 @@ def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, wind
             bj = wij * (bi + float(j) * c1)
             cj = wij * c2
             for m in ti.static(range(3)):
-                add_to(window, first + (i * 64 + j * 8 + m), w[m][2] * (bj + float(m) * cj))
+                n = first + (i * ti.static(layer(window)) + j * 8 + m)
+                if ti.static(is_whole(window)):
+                    left = add_whole(window, n, left + w[m][2] * (bj + float(m) * cj))
+                else:
+                    add_to(window, n, w[m][2] * (bj + float(m) * cj))
+
+
+@ti.func
+def largest_share(mass: ti.f32, v: vec3, Q: mat3, E01: vec4, E02: vec4, E12: vec4, D0: vec4, D1: vec4, D2: vec4):
+    """Momentum (kg cells/s) that no node gets more of, on any axis, from a particle of ``mass`` with velocity ``v``
+    that ``spread_kept`` spreads with the slopes ``Q`` (kg/s) of its momentum."""
+    size = 0.0
+    for r in ti.static(range(3)):
+        # Nodes are within 1.5 cells on each axis; the last three modes have 1/8 at most, as h in ``spread_kept`` has.
+        slopes = ti.abs(Q[r, 0]) + ti.abs(Q[r, 1]) + ti.abs(Q[r, 2])
+        mixed = ti.abs(E01[r]) + ti.abs(E02[r]) + ti.abs(E12[r])
+        along = ti.abs(D0[r]) + ti.abs(D1[r]) + ti.abs(D2[r])
+        size = ti.max(size, mass * (ti.abs(v[r]) + 16.0 * 2.25 * mixed + 0.125 * along) + 1.5 * slopes)
+    return LARGEST_WEIGHT * size

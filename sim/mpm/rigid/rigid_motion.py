@@ -288,5 +288,5 @@ def advance_bodies(
                     prepare_contacts(w, step, bodies, contacts)
                     sweep_contacts(w, step, SWEEPS, bodies, contacts)
                     finish_and_move(w, step, bodies, contacts)
-                forget_reports(w, worlds, bodies)
+                forget_reports(True, w, worlds, bodies)
                 settle(w, limits, worlds)
