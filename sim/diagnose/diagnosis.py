@@ -145,6 +145,10 @@ class Fits(FittedModels, Protocol):
     def simulate(self, fit: CandidateFit) -> dict[str, Array]:
         """Return points (T, K, 3) in m at the frames of every trial, by its name, simulated from its first frames."""
 
+    def hidden_spins(self, fit: CandidateFit) -> dict[str, Array]:
+        """Return the spin (3,) in rad/s at the first frame of every trial, by its name, whose points do not show it: of
+        the one body of a capture."""
+
     def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
         """Return the discrepancy by trial; with a ``fit`` as that candidate explains it, which is less noisy."""
 

@@ -220,6 +220,7 @@ def _confirm(
     cancelled: IsCancelled,
 ) -> tuple[list[VerificationRun], list[str]]:
     results: list[VerificationRun] = []
+    nominal_spins, found_spins = fits.hidden_spins(fits.nominal), fits.hidden_spins(found)
     for trial in capture.fit_trials[:CONFIRMED_TAKES]:
         on_event({"event": "notice", "stage": "diagnose", "message": f"verification run of {trial.name} in the engine"})
         try:
@@ -232,6 +233,8 @@ def _confirm(
                     nominal_points[trial.name],
                     found_points[trial.name],
                     cancelled,
+                    nominal_spin=nominal_spins.get(trial.name),
+                    verdict_spin=found_spins.get(trial.name),
                 )
             )
         except InputError as error:

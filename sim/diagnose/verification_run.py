@@ -78,11 +78,15 @@ def run_verification(
     nominal_points: Array,
     verdict_points: Array,
     cancelled: IsCancelled,
+    *,
+    nominal_spin: Array | None = None,
+    verdict_spin: Array | None = None,
 ) -> VerificationRun:
     """Run ``trial`` of a capture of one object in the engine.
 
     nominal_points, verdict_points: (T, K, 3) m, the trial in the proposing models; the engine starts from their first
-    frames. Raises what the engine raises.
+    frames. nominal_spin, verdict_spin: (3,) rad/s at the first frame, where no point shows it; None: from the points.
+    Raises what the engine raises.
     """
     item = capture.objects[0]
     first, end = _stretch(capture, item, trial, nominal_points, verdict)
@@ -90,10 +94,12 @@ def run_verification(
     nominal_points, verdict_points = nominal_points[first:end], verdict_points[first:end]
     rates = verdict.parameters.get("time_scale", {})
     rate = rates["rate"].value if "rate" in rates else 1.0
-    runs = [_simulate(capture, item, trial, nominal, nominal_points, 1.0, level) for level in range(2)]
+    start = starting_state(trial, nominal_points, spin=nominal_spin)
+    runs = [_simulate(capture, item, trial, nominal, start, 1.0, level) for level in range(2)]
     if cancelled():
         raise Cancelled("cancelled during the verification run")
-    runs.append(_simulate(capture, item, trial, verdict, verdict_points, rate, 1))
+    start = starting_state(trial, verdict_points, rate, spin=verdict_spin)
+    runs.append(_simulate(capture, item, trial, verdict, start, rate, 1))
     coarse, fine, found = runs
     frames = slice(1, None)
     return VerificationRun(
@@ -135,14 +141,13 @@ def _simulate(
     item: CaptureObject,
     trial: Trial,
     fit: CandidateFit,
-    points: Array,
+    state: StartingState,
     rate: float,
     level: int,
 ) -> Array:
     """Return tracked points (T, K, 3) in m at the frames of ``trial``, simulated in the engine."""
     from ..mpm.world import Worlds
 
-    state = starting_state(trial, points, rate)
     setup, options = world_setup(capture, item, fit, state, level)
     body = setup.bodies[0]
     start = body.positions
@@ -180,10 +185,11 @@ class StartingState:
     about: Array
 
 
-def starting_state(trial: Trial, points: Array, rate: float = 1.0) -> StartingState:
+def starting_state(trial: Trial, points: Array, rate: float = 1.0, *, spin: Array | None = None) -> StartingState:
     """Return the state at the first frame of noise-free points (T, K, 3) m of a body that is rigid until contact.
 
-    rate: true over recorded time.
+    rate: true over recorded time. spin: (3,) rad/s at the first frame; None: from how the points turn, 0 for fewer than
+    three.
     """
     count = min(5, len(points))
     times = (trial.times[:count] - trial.times[0]) * rate
@@ -193,9 +199,10 @@ def starting_state(trial: Trial, points: Array, rate: float = 1.0) -> StartingSt
     way = np.array([turn @ centre + shift for turn, shift in poses])
     degree = 2 if count > 3 else 1
     velocity = np.polynomial.polynomial.polyfit(times, way, degree)[1]
-    first = Rotation.from_matrix(poses[0][0])
-    turns = np.array([(Rotation.from_matrix(turn) * first.inv()).as_rotvec() for turn, _ in poses])
-    spin = np.polynomial.polynomial.polyfit(times, turns, degree)[1]
+    if spin is None:
+        first = Rotation.from_matrix(poses[0][0])
+        turns = np.array([(Rotation.from_matrix(turn) * first.inv()).as_rotvec() for turn, _ in poses])
+        spin = np.polynomial.polynomial.polyfit(times, turns, degree)[1]
     return StartingState(rotation=poses[0][0], translation=poses[0][1], velocity=velocity, spin=spin, about=way[0])
 
 

@@ -35,6 +35,7 @@ from .rigid_prediction import (
     Points,
     believed_fit,
     contact_spread,
+    hidden_spins,
     marginal_points,
     marginal_rms,
     noise_floor,
@@ -105,6 +106,10 @@ class RigidFits:
     def simulate(self, fit: CandidateFit) -> dict[str, Array]:
         """See ``Fits``."""
         return self._joined(simulate_points, fit, list(self.capture.trials))
+
+    def hidden_spins(self, fit: CandidateFit) -> dict[str, Array]:
+        """See ``Fits``."""
+        return {name: spin for found in self._own(fit) for name, spin in hidden_spins(found).items()}
 
     def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
         """See ``Fits``."""

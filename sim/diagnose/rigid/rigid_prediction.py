@@ -175,6 +175,17 @@ def simulate_points(fit: Fit) -> Points:
     return found
 
 
+def hidden_spins(fit: Fit) -> dict[str, Array]:
+    """Return by trial the spin (3,) in rad/s at its first frame with which ``simulate_points`` moves it, where no point
+    shows the spin."""
+    found = {}
+    for i, (trial, states) in enumerate(zip(fit.problem.trials, fit.states, strict=True)):
+        if trial.observations.hides_spin:
+            first = next((s.record[0] for s in fit.evaluation.segments if s.trial == i), states[0])
+            found[trial.observations.trial.name] = np.array(first[10:13])
+    return found
+
+
 def step_size_error(fit: Fit) -> float:
     """Return the RMS distance in m by which ``fit``'s trials move when the step is halved."""
     problem = fit.problem

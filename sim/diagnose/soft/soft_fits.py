@@ -260,6 +260,10 @@ class SoftFits:
         """Return the world parameters of ``fit``, which must be one of this object's fits."""
         return self._laws[id(fit)]
 
+    def hidden_spins(self, fit: CandidateFit) -> dict[str, Array]:
+        """See ``Fits``: points of a deformable body show its spin."""
+        return {}
+
     def discrepancy(self, fit: CandidateFit | None) -> dict[str, Discrepancy]:
         """See ``Fits``."""
         nominal = {t.name: p for t, p in zip(self._trials, self._in_ground(self._survey.base), strict=True)}
