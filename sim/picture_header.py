@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How many pixels a picture file claims, from its header alone: for decoders that ask nobody before they take memory.
+"""How many pixels a picture file claims, from its header alone: for decoders that take memory unchecked.
 
 Blender decodes whatever a file is, by its content and however large. Pillow is not among the packages of its Python, so
 the headers are read here.

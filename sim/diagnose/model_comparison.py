@@ -141,26 +141,42 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
         claims = np.array(predicted) * (np.array(weights) + 1e-12)
         yielded = max(predicted) * max(0.0, 1.0 - sum(shares))
         shares = [s + yielded * c for s, c in zip(shares, claims / claims.sum(), strict=True)]
-    probabilities: dict[str, float] = {}
-    best: dict[str, tuple[float, CandidateFit]] = {}
-    for fit, share in zip(candidates, shares, strict=True):
-        name = fit.effects[0] if fit.effects else NONE
-        probability = float(share)
-        probabilities[name] = probabilities.get(name, 0.0) + probability
-        if name not in best or probability > best[name][0]:
-            best[name] = (probability, fit)
+    probabilities, best = _by_name(candidates, shares)
+    top = max(probabilities, key=lambda n: probabilities[n])
+    named, behind = _by_name(candidates, shares, causes=(top, *best[top].effects[1:]))
+    if max(named, key=lambda n: named[n]) == top:
+        probabilities, best = named, behind
     probabilities[UNKNOWN] = max(0.0, 1.0 - sum(probabilities.values()))
     total = sum(probabilities.values())
     barred = {NONE} if against.said else set()
     probabilities = _never_sure({name: p / total for name, p in probabilities.items()}, weighing.lapse, barred)
-    found = {name: fit for name, (_, fit) in best.items()}
-    verdict = _verdict(probabilities, found, weighing)
+    verdict = _verdict(probabilities, best, weighing)
     reasons = {
-        name: _reason(fit, found, fits, weighing) if fit.effects else against.said or BETTER
-        for name, fit in found.items()
+        name: _reason(fit, best, fits, weighing) if fit.effects else against.said or BETTER
+        for name, fit in best.items()
         if name not in (verdict.effect, *verdict.effects, *verdict.alternatives)
     }
-    return ModelComparison(verdict=verdict, probabilities=probabilities, best=found, reasons=reasons)
+    return ModelComparison(verdict=verdict, probabilities=probabilities, best=best, reasons=reasons)
+
+
+def _by_name(
+    candidates: Sequence[CandidateFit], shares: Sequence[float], causes: Sequence[str] = ()
+) -> tuple[dict[str, float], dict[str, CandidateFit]]:
+    """Return the sum of ``shares`` by the effect that each candidate counts for, and the likeliest candidate of each.
+
+    That is its first effect. causes: effects of the likeliest pair, the first one first: another pair that has one of
+    the others counts for the effect that it has beside that, in place of the first.
+    """
+    probabilities: dict[str, float] = {}
+    best: dict[str, tuple[float, CandidateFit]] = {}
+    for fit, share in zip(candidates, shares, strict=True):
+        name = fit.effects[0] if fit.effects else NONE
+        if len(fit.effects) > 1 and name in causes[1:] and causes[0] not in fit.effects:
+            name = fit.effects[1]
+        probabilities[name] = probabilities.get(name, 0.0) + float(share)
+        if name not in best or share > best[name][0]:
+            best[name] = (float(share), fit)
+    return probabilities, {name: fit for name, (_, fit) in best.items()}
 
 
 def _never_sure(probabilities: Mapping[str, float], lapse: float, barred: Collection[str]) -> dict[str, float]:
@@ -398,10 +414,13 @@ def _verdict(
     name = max(probabilities, key=lambda n: probabilities[n])
     top = probabilities[name]
     share = weighing.alternative if name not in (NONE, UNKNOWN) else 2 * weighing.alternative
+    causes = best[name].effects if name in best else ()
     others = [
         n
         for n in sorted(probabilities, key=lambda n: -probabilities[n])
         if n not in (name, UNKNOWN, NONE)
+        # One of several causes is an alternative alone, not with a third one.
+        and not (n in causes and len(best[n].effects) > 1)
         and probabilities[n] >= top * (TWIN_SHARE if n in TWINS.get(name, ()) else share)
     ][:MOST_ALTERNATIVES]
     if name in (NONE, UNKNOWN):

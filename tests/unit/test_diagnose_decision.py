@@ -126,6 +126,20 @@ def test_a_second_cause_at_contacts_shows_in_held_out_trials(left, both):
     assert compare_models(little, ComparisonSettings()).verdict.effects == ("air_drag",)
 
 
+def test_a_pair_that_shares_a_cause_with_the_verdict_is_named_by_the_other():
+    """Drag and lift beside wind and lift: what the data cannot tell apart are drag and wind, and not drag and lift."""
+    singles = fit("air_drag", evidence=300, misfit=3.0), fit("magnus", evidence=200, misfit=3.5)
+    singles += (fit("wind", evidence=100, misfit=4.0),)
+    pairs = fit("air_drag", "magnus", evidence=2000, rms=0.004), fit("magnus", "wind", evidence=1999, rms=0.004)
+    result = weighed(*singles, *pairs, nominal_misfit=6.0)
+    assert result.verdict.effects == ("air_drag", "magnus") and result.verdict.alternatives == ("wind",)
+    assert result.best["wind"].effects == ("magnus", "wind") and result.best["magnus"].effects == ("magnus",)
+    assert result.probabilities["magnus"] < 0.01 < result.probabilities["wind"] < result.probabilities["air_drag"]
+    # As much in all for the pair with wind as for the verdict: each counts for its first effect, and none is hidden.
+    even = weighed(*singles, pairs[0], dataclasses.replace(pairs[1], log_evidence=2000.0), nominal_misfit=6.0)
+    assert even.verdict.effects == ("air_drag", "magnus") and "magnus" not in even.verdict.alternatives
+
+
 def test_a_pair_names_what_is_the_same_motion():
     singles = (
         fit("time_scale", evidence=900, misfit=2.2),

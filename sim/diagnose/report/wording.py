@@ -378,6 +378,11 @@ def assumptions(capture: Capture) -> list[str]:
         f"{_trials(capture)} The initial state of each trial (position, velocity, spin) was estimated from its first "
         "frames."
     )
+    if camera is None and all(len(trial.rest_points) == 1 for trial in capture.trials):
+        lines.append(
+            "One point is tracked, so that spin shows in the path alone: of Magnus lift only the product of strength "
+            "and spin is known."
+        )
     return lines
 
 

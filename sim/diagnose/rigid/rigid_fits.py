@@ -72,6 +72,10 @@ UNEXPLAINED = 1.5
 SHARPENINGS = 3
 """Repetitions in which the noise of single points follows the closest fit."""
 
+LIFT_SPREAD = 0.7
+"""Standard deviation of the logarithm of a lift where no point shows the spin: a path tells their product alone, and
+the surface of thrown and struck balls moves at some 0.1 to 1.5 of their speed."""
+
 WORSE = 1.2
 """Factor on the nominal error of complete trials up to which the mean over plausible contacts is preferred."""
 
@@ -391,8 +395,10 @@ def _estimates(scene: BodyScene, fit: Fit, name: str, draws: Array) -> dict[str,
     best, many = values(fit.z), [values(d) for d in draws]
     found, normal = {}, np.random.default_rng(1).normal(size=len(draws))
     for k, v in best.items():
-        spread = _other_contact(name, v, normal) - v
-        low, high = np.percentile(np.array([m[k] for m in many]) + spread, (2.5, 97.5))
+        drawn = np.array([m[k] for m in many]) + _other_contact(name, v, normal) - v
+        if name == "magnus" and scene.unscaled:
+            drawn *= np.exp(LIFT_SPREAD * normal)
+        low, high = np.percentile(drawn, (2.5, 97.5))
         low, high = np.clip((low, high), schema[k].low, schema[k].high)
         found[k] = Estimate(value=v, unit=schema[k].unit, low=float(min(low, v)), high=float(max(high, v)))
     return found
