@@ -232,7 +232,7 @@ def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:
     return ""
 
 
-OUTLYING = 3.0
+MOST_ELSEWHERE = 3.0
 """A trial in which the body comes to lie on another face counts at most as this many times the median one: its distance
 says that it fell the other way, not by how much the model is wrong."""
 
@@ -243,7 +243,7 @@ def _surprise(fit: CandidateFit) -> float:
     known = np.isfinite(trials)
     away = np.array(fit.heldout_elsewhere, dtype=bool) & known if fit.heldout_elsewhere else np.zeros_like(known)
     if known.sum() > 2:
-        trials[away] = np.minimum(trials[away], OUTLYING * float(np.median(trials[known])))
+        trials[away] = np.minimum(trials[away], MOST_ELSEWHERE * float(np.median(trials[known])))
     return float(np.sum(trials[known] ** 2))
 
 

@@ -15,7 +15,7 @@ from .shooting_problem import Problem, Segment, SegmentedTrial
 BEND_EVERY = 0.05
 """Time in s per polynomial degree of the smooth remainder."""
 LEAST_FRAMES = 6
-OUTLYING = 3.0
+MOST_OF_A_TRIAL = 3.0
 """A trial's misfit counts at most as this many times the median trial's: one in which the body was lost, or tumbled
 chaotically, does not decide for all."""
 
@@ -52,7 +52,7 @@ def misfit(fit: Fit) -> Misfit:
     count = sums[:, 1] + sums[:, 3]
     square = (sums[:, 0] + sums[:, 2]) / np.maximum(count, 1)
     if (count > 0).sum() >= 3:
-        most = OUTLYING**2 * float(np.median(square[count > 0]))
+        most = MOST_OF_A_TRIAL**2 * float(np.median(square[count > 0]))
         sums[:, [0, 2]] *= np.minimum(1.0, most / np.maximum(square, 1e-12))[:, None]
     flight, flights, contact, contacts = (float(x) for x in sums.sum(axis=0))
     return Misfit(flight=flight, flight_count=int(flights), contact=contact, contact_count=int(contacts))

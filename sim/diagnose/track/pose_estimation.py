@@ -197,7 +197,7 @@ def pose_scatter(residual: Array) -> float | None:
 MOVING_PX = 0.5
 """Way per frame in px from which a body moves: patches are blurred, and found between pixels."""
 
-OUTLYING = 3.0
+MOST_OF_A_FRAME = 3.0
 """A frame's noise counts at most as this many times that of the median frame."""
 
 
@@ -230,7 +230,7 @@ def rigid_noise(residual: Array, places: Array) -> float | None:
     frames = (squares / np.maximum(2 * count - 6, 1))[count >= LEAST_POINTS]
     if least is None or len(frames) == 0:
         return least
-    frames = np.minimum(frames, OUTLYING**2 * float(np.median(frames)))
+    frames = np.minimum(frames, MOST_OF_A_FRAME**2 * float(np.median(frames)))
     return max(least, float(np.sqrt(np.mean(frames))))
 
 
