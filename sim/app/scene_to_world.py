@@ -210,16 +210,7 @@ class PreparedWorld:
 
     def on(self, arch: str) -> PreparedWorld:
         """Return the same, with the cost on another architecture."""
-        bodies, step = len(self.setup.bodies), self.stable_step
-        cost = estimate(
-            self.particle_count,
-            bodies,
-            step,
-            self.duration,
-            arch,
-            file_bytes=self.file_bytes,
-            largest=_largest(self.setup),
-        )
+        cost = _cost(self.setup, self.particle_count, self.stable_step, self.duration, arch, self.file_bytes)
         return dataclasses.replace(self, arch=arch, cost=cost)
 
 
@@ -283,9 +274,7 @@ def prepare_world(
         body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
         collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
         warnings=tuple(warnings),
-        cost=estimate(
-            count, len(setup.bodies), step, duration, options.arch, file_bytes=files, largest=_largest(setup)
-        ),
+        cost=_cost(setup, count, step, duration, options.arch, files),
         stable_step=step,
         duration=duration,
         arch=options.arch,
@@ -305,9 +294,10 @@ def _soft_count(setup: WorldSetup) -> int:
     return sum(body.count for body in setup.bodies if not body.rigid)
 
 
-def _largest(setup: WorldSetup) -> int:
-    """Particles of the largest body; a rigid one's mesh is filled, too."""
-    return max((body.count for body in setup.bodies), default=0)
+def _cost(setup: WorldSetup, particles: int, step: float, duration: float, arch: str, file_bytes: int) -> Estimate:
+    """The cost of ``setup``, with the particles of its largest body; a rigid one's mesh is filled, too."""
+    largest = max((body.count for body in setup.bodies), default=0)
+    return estimate(particles, len(setup.bodies), step, duration, arch, file_bytes=file_bytes, largest=largest)
 
 
 def _granular(scene: SceneModel) -> set[str]:
