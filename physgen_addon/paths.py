@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Folder paths as entered in Blender."""
+"""Folder paths as entered in Blender, and pictures opened from files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import bpy
 from ..sim.cache.bake_folder import load_manifest
 from ..sim.errors import InputError
 from ..sim.files import shown
+from ..sim.picture_header import require_picture
 from ..sim.validation import DEVICES
 from . import blend_trust
 
@@ -221,3 +222,16 @@ def shown_bake(scene: bpy.types.Scene) -> Path | None:
     the user's word."""
     path = scene.physgen.simulation.bake
     return absolute(path) if path and not blend_trust.is_pending(path) else None
+
+
+def load_image(path: Path, *, check_existing: bool = False) -> bpy.types.Image:
+    """Return the image at ``path``, once its header claims no more pixels than such a file may have: Blender decodes
+    whatever it says.
+
+    check_existing: as of ``bpy.data.images.load``. Raises InputError where it cannot be read or claims too much.
+    """
+    require_picture(path)
+    try:
+        return bpy.data.images.load(str(path), check_existing=check_existing)
+    except RuntimeError:
+        raise InputError(f"{path}: cannot be read; check that it is there and may be read") from None

@@ -16,12 +16,11 @@ from ...sim.app.propose import best_proposals
 from ...sim.app.stage_process import run_stage
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
-from ...sim.picture_header import require_picture
 from ...sim.reconstruct.reconstruct_options import Proposal
 from ..background_jobs import JobOperator, Work
 from ..context import TAB, redraw, show_beside
 from ..interpreter import cli_command, find_python
-from ..paths import require_folder
+from ..paths import load_image, require_folder
 from ..photo.photo_image import PhotoTool, on_screen, place_under, shows_photo
 from ..photo.photo_maths import box_overlap, simplified
 from ..photo.photo_request import photo_file, scene_folder
@@ -146,11 +145,7 @@ def _shrunk(mask: NDArray[np.bool_], times: int) -> NDArray[np.bool_]:
 
 def _pixels(path: Path) -> NDArray[np.float32]:
     """Return the values of a picture as stored, 0 to 1, (H, W, 4), first row at the bottom."""
-    require_picture(path)
-    try:
-        image = bpy.data.images.load(str(path))
-    except RuntimeError as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
+    image = load_image(path)
     try:
         width, height = image.size
         values = np.empty(width * height * 4, dtype=np.float32)

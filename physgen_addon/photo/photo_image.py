@@ -14,9 +14,9 @@ import numpy as np
 from mathutils import Vector
 
 from ...sim.errors import InputError
-from ...sim.picture_header import require_picture
 from ..compat import OperatorMixin
 from ..context import redraw, scene_with
+from ..paths import load_image
 from .photo_maths import Mask, ellipse, extent, resized
 
 MAX_TURNED = 2048
@@ -35,11 +35,11 @@ def load_photo_image(path: Path) -> tuple[bpy.types.Image, tuple[int, int]]:
         raise InputError(f"{path}: there is no such photo; check its name")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: is no photo; give a JPEG, PNG, TIFF or WebP file")
-    require_picture(path)
+    image = load_image(path)
     try:
         turn = orientation(path)
-        image = bpy.data.images.load(str(path), check_existing=False)
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
+        bpy.data.images.remove(image)
         raise InputError(f"{path}: cannot be read ({error}); check that the file may be read") from None
     width, height = image.size
     if not width or not height:
@@ -192,8 +192,7 @@ def first_mask(state: bpy.types.PropertyGroup, box: bpy.types.PropertyGroup, fou
     if box.mask is not None and all(box.mask.size):
         return resized(read_mask_image(box.mask), width, height)
     if found.is_file():
-        require_picture(found)
-        image = bpy.data.images.load(str(found), check_existing=False)
+        image = load_image(found)
         try:
             if all(image.size):
                 return resized(read_mask_image(image), width, height)

@@ -20,6 +20,7 @@ import bpy
 from ...sim.errors import InputError
 from ...sim.files import MOST_HASHED, open_file
 from ...sim.picture_header import require_picture
+from ..paths import load_image
 
 LAYERS, LOOK, TREE = "PhysGen Layers", "PhysGen Look", "PhysGen Compositing"
 OURS = "physgen_look"
@@ -109,9 +110,9 @@ def _names(head: bytes) -> dict[str, int]:
 
 
 def _sequence(frames: list[Path]) -> bpy.types.Image:
-    for path in frames:
+    for path in frames[1:]:
         require_picture(path)
-    image = bpy.data.images.load(str(frames[0]), check_existing=True)
+    image = load_image(frames[0], check_existing=True)
     image.source = "SEQUENCE"
     image.reload()
     return image

@@ -16,11 +16,11 @@ from mathutils import Matrix, Quaternion, Vector
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
-from ...sim.picture_header import require_picture
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene
 from ...sim.scene.model import Camera, Light
 from .. import compat
+from ..paths import load_image
 from ..render.render_regions import plane_axes
 from .export_meshes import box_corners
 
@@ -149,11 +149,7 @@ def load_picture(made: Made, path: Path) -> bpy.types.Image:
     """Return the image at ``path``, packed, so that the .blend needs no file beside it. Raises InputError if it is
     unreadable, or claims more pixels than a picture has: Blender would take the memory before it says so.
     """
-    require_picture(path)
-    try:
-        image = made.add(bpy.data.images.load(str(path), check_existing=False))
-    except RuntimeError:
-        raise InputError(f"{path}: cannot be read; check that it is there and may be read") from None
+    image = made.add(load_image(path))
     # A damaged file is detected only on access; Blender then logs it to the console.
     if not image.size[0] or not image.size[1]:
         raise InputError(f"{path}: is not a readable picture; restore it or make the scene again")
