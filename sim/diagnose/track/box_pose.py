@@ -9,7 +9,7 @@ direction, so that nothing has to be matched. Shadows and other spurs stand out 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,19 +119,19 @@ def follow_box(outlines: Sequence[Array], edges: Array, picture: tuple[int, int]
     if np.abs(np.diff(turns)).max(initial=0.0) > FASTEST * cycle:
         return None
     centres = np.column_stack([states[:, :2], np.full(len(states), edges[2] / 2)])
-    sound = ~(stands_out(states[:, 3], np.abs) | stands_out(misses, lambda off: off))
+    # A smaller residual is no fault.
+    sound = ~((np.abs(standing_out(states[:, 3])) > STANDS_OUT) | (standing_out(misses) > STANDS_OUT))
     return BoxMotion(
         camera=_camera(camera, picture), centres=centres, turns=turns, residual=residual, edges=edges, sound=sound
     )
 
 
-def stands_out(values: Array, how: Callable[[Array], Array]) -> NDArray[np.bool_]:
-    """Return (T,) whether ``values`` (T,) px differ from the median of their neighbours by far more than they usually
-    do. how: what of the differences counts, such as their size, or they themselves where only more is wrong."""
+def standing_out(values: Array) -> Array:
+    """Return by how many robust standard deviations, at least ``LEAST_OUT_PX`` each, ``values`` (T,) px differ from the
+    median of their neighbours."""
     near = [np.median(values[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1]) for k in range(len(values))]
     off = values - np.array(near)
-    usual = max(1.4826 * float(np.median(np.abs(off))), LEAST_OUT_PX)
-    return np.asarray(how(off) > STANDS_OUT * usual)
+    return off / max(1.4826 * float(np.median(np.abs(off))), LEAST_OUT_PX)
 
 
 def repeats_after(edges: Array) -> float:
