@@ -432,6 +432,15 @@ def test_a_hollow_ball_is_told_by_the_speed_at_which_it_begins_to_roll():
     assert best.heldout_chi == pytest.approx(np.sqrt(np.mean(np.square(best.heldout_trials))), rel=1e-9)
 
 
+def test_inertia_is_missed_where_the_ground_turns_the_ball():
+    """It was placed nowhere: only forces were compared, and another inertia is none."""
+    fits = fit_rigid(skidding(5 / 3), ["inertia"])
+    score = fits.discrepancy(fits.candidates[0])["take0"].frame_score
+    # Friction turns a believed ball 5/3 times as fast, until the ball rolls, from 0.136 s on.
+    assert score[2:12] == pytest.approx(2 / 3 * 0.3 * 9.81 / (0.4 * 5 / 3), rel=0.1)
+    assert score[16:] == pytest.approx(0.0, abs=0.05)
+
+
 def test_a_solid_ball_is_not_called_hollow():
     fits = fit_rigid(skidding(1.0), ["inertia"])
     assert all(c.log_evidence < fits.nominal.log_evidence + 2 for c in fits.candidates)

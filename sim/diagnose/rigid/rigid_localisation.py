@@ -150,6 +150,9 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
         arm = np.einsum("fij,j->fi", as_matrix(record[:, 3:7]), setting.center)
         w = record[:, 10:13]
         lack += _by_frame(np.cross(w, np.cross(w, arm)), nearest, frames)
+    if setting.inertia != 1.0:
+        turning = _turning_difference(used.problem, setting, clock, record, gains[:, 2] > 0)
+        lack += np.stack([_summed(t, nearest, frames) for t in turning.T], axis=1) / spacing[:, None]
     if setting.rate != 1.0:
         lack += (setting.rate**2 - 1) * np.asarray(scene.capture.gravity)
     if setting.camera is not None:
@@ -171,11 +174,36 @@ def _force_difference(base: WorldSettings, setting: WorldSettings, record: Array
     return np.asarray(force)
 
 
+def _turning_difference(
+    problem: Problem, setting: WorldSettings, clock: Array, record: Array, touching: NDArray[np.bool_]
+) -> Array:
+    """Return the change of velocity (M, 3) in m/s, up to the next time of ``clock`` (M,), of the lowest point of a
+    body that the ground turns with the inertia of ``setting``, minus that with the believed one. Nothing else turns it
+    otherwise, so this is zero where it is not ``touching`` (M,).
+    """
+    turns = as_matrix(record[:, 3:7])
+    tensor = turns @ problem.scene.body.inertia @ np.swapaxes(turns, 1, 2)
+    momentum = np.einsum("mij,mj->mi", tensor, record[:, 10:13])
+    gained = np.diff(momentum, axis=0, append=momentum[-1:])
+    gained[~touching | (np.diff(clock, append=clock[-1]) <= 0)] = 0.0
+    # The believed body gets the same angular momentum, which turns it as many times faster as its inertia is smaller.
+    spin = (1 - setting.inertia) * np.linalg.solve(tensor, gained[:, :, None])[:, :, 0]
+    return np.cross(spin, _lowest(problem, record))
+
+
+def _lowest(problem: Problem, record: Array) -> Array:
+    """Return the way (M, 3) in m from the reference point to the point of the body nearest to the ground."""
+    body, normal = problem.scene.body, problem.scene.capture.ground.unit_normal
+    corners = np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), body.corners)
+    nearest = np.argmin(corners @ normal, axis=1)
+    return np.asarray(corners[np.arange(len(corners)), nearest] - body.radius * normal)
+
+
 def _gap(problem: Problem, record: Array) -> Array:
     """Return the distance (M,) of the body to the ground."""
-    body, ground = problem.scene.body, problem.scene.capture.ground
-    corners = record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), body.corners)
-    return np.asarray(((corners - np.asarray(ground.point)) @ ground.unit_normal).min(axis=1) - body.radius)
+    ground = problem.scene.capture.ground
+    feet = record[:, :3] + _lowest(problem, record)
+    return np.asarray((feet - np.asarray(ground.point)) @ ground.unit_normal)
 
 
 def measured_force(fit: Fit, index: int) -> Array:
