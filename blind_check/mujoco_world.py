@@ -32,6 +32,9 @@ CONTACT_RATE = 1600.0
 STRIKE_M_S = 0.08
 """Normal speed from which a contact counts as an impact."""
 
+TURN_M_S2 = 0.5
+"""Acceleration of the surface about the centre from which the ground turns a body: not one that rests or rolls."""
+
 GRAVITY = 9.81
 _GRIP = 100.0
 """MuJoCo impratio, so that sticking contacts do not creep."""
@@ -110,7 +113,8 @@ class Motion:
     """Motion at T times: position (T, 3), rotation (T, 3, 3).
 
     Over the interval around each frame: touched (T,) whether it touched the ground, struck (T,) whether at more than
-    ``STRIKE_M_S``, slid (T,) whether the contact slid, pulled (T,) whether adhesion acted; push (T, 3) m/s².
+    ``STRIKE_M_S``, slid (T,) whether the contact slid, pulled (T,) whether adhesion acted, turned (T,) whether the
+    ground changed its spin by more than ``TURN_M_S2``; push (T, 3) m/s².
     """
 
     position: Array
@@ -119,6 +123,7 @@ class Motion:
     struck: NDArray[np.bool_]
     slid: NDArray[np.bool_]
     pulled: NDArray[np.bool_]
+    turned: NDArray[np.bool_]
     push: Array
 
     def points(self, rest: Array) -> Array:
@@ -237,6 +242,7 @@ class _Recorder:
         self._world, self._model, self._data, self._mujoco = world, model, data, mujoco
         self._body = model.body("body").id
         self._mass = float(model.body_mass[self._body])
+        self._inertia, self._size = float(model.body_inertia[self._body].max()), world.body.size
         self._first = 3 if world.ground_motion is not None else 0  # degrees of freedom of the ground come first
         smooth = world.push is not None and world.adhesion is None and world.ground_motion is None
         smooth = smooth and world.rolling == 0
@@ -245,7 +251,7 @@ class _Recorder:
         # Smooth forces may be held for half a millisecond; contact-dependent ones are evaluated at each step.
         self._stride = 5 if smooth else (10 if free else 1)
         self._position, self._rotation = np.zeros((frames, 3)), np.zeros((frames, 3, 3))
-        self._flags = np.zeros((4, frames), dtype=bool)
+        self._flags = np.zeros((5, frames), dtype=bool)
         self._push = np.zeros((frames, 3))
 
     def place(self, state: State, time: float) -> None:
@@ -315,6 +321,8 @@ class _Recorder:
             self._flags[0, frame] = True
             self._flags[1, frame] |= abs(slip[2]) > STRIKE_M_S
             self._flags[2, frame] |= math.hypot(slip[0], slip[1]) > 0.02
+            torque = np.linalg.norm(data.qfrc_constraint[first + 3 : first + 6])
+            self._flags[4, frame] |= bool(torque * self._size > TURN_M_S2 * self._inertia)
         if self._world.adhesion is not None:
             # A resting body jitters by micrometres, which is no separation.
             self._flags[3, frame] |= self._pull(data.qpos[first:], v) < 0 and v[2] > 0.01
@@ -336,6 +344,7 @@ class _Recorder:
             struck=self._flags[1],
             slid=self._flags[2],
             pulled=self._flags[3],
+            turned=self._flags[4],
             push=self._push,
         )
 

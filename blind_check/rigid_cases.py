@@ -387,13 +387,13 @@ def _active(cause: Cause, motion: Motion, times: Array) -> NDArray[np.bool_]:
     if cause.active == "rolling":
         moved = np.linalg.norm(np.gradient(motion.position[:, :2], times, axis=0), axis=1) > 0.02
         return _closed(motion.touched & moved)
-    if cause.active == "slid":
-        return _closed(motion.slid)
+    if cause.active in ("slid", "turned"):
+        return _closed(motion.slid if cause.active == "slid" else motion.turned)
     return {"touched": motion.touched, "struck": motion.struck, "pulled": motion.pulled}[cause.active]
 
 
 def _closed(flags: NDArray[np.bool_], gap: int = 2) -> NDArray[np.bool_]:
-    """Return ``flags`` with gaps of up to ``gap`` frames closed: sliding on edges briefly leaves the ground."""
+    """Return ``flags`` with gaps of up to ``gap`` frames closed: a body on its edges briefly leaves the ground."""
     return binary_closing(np.pad(flags, gap), np.ones(gap + 1, dtype=bool))[gap:-gap]
 
 

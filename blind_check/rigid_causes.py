@@ -23,7 +23,7 @@ from .mujoco_world import GRAVITY, Array, Push, RigidWorld
 AIR = 1.2
 """Density of air, kg/m³."""
 
-ACTIVE = ("push", "always", "touched", "struck", "slid", "pulled", "rolling", "window")
+ACTIVE = ("push", "always", "touched", "struck", "slid", "pulled", "turned", "rolling", "window")
 """When a cause acts: while its force exceeds a tenth of its maximum, always, during contact, while sliding, …"""
 
 
@@ -314,7 +314,7 @@ def inertia(world: RigidWorld, rng: np.random.Generator) -> Cause:
         low=0.04,
         high=2 / 3,
         styles=("toss", "toss", "slide") if world.body.shape == "sphere" else ("toss", "spun", "drop"),
-        active="touched",
+        active="turned",
         change=lambda s, w: dataclasses.replace(w, inertia=1 + s),
         parameters=lambda s: {"factor": 1 + s},
     )

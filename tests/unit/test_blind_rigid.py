@@ -85,6 +85,18 @@ def test_a_rolling_ball_keeps_rolling_unless_something_resists():
     assert lost == pytest.approx(0.5 * 0.02 * 9.81 * 5 / 7 * TIMES[-1] ** 2, rel=0.05)
 
 
+def test_the_ground_turns_a_ball_until_it_rolls_and_a_cube_until_it_rests():
+    """Another inertia acts there, and neither in flight nor where a ball rolls on."""
+    times = np.arange(40) / 100
+    ball = simulate_rigid(_world(), _state(0.04, (1, 0, 0)), times)
+    rolls = 2 * 1.0 / (7 * 0.3 * 9.81)
+    # It is pressed down anew a few times, so not each single frame has a contact.
+    assert ball.turned[:10].mean() > 0.5 and not ball.turned[times > rolls + 0.02].any() and ball.touched[20:].all()
+    assert not simulate_rigid(_world(), _state(5.0, (1, 2, 3), (4, 5, 6)), times).turned.any()
+    lying = simulate_rigid(_world(CUBE), _state(0.04), times)
+    assert lying.touched.all() and not lying.turned[5:].any()
+
+
 def test_adhesion_takes_its_work_from_the_bounce():
     times, pull, reach = np.linspace(0, 0.5, 501), 30.0, 0.005
     free, held = (

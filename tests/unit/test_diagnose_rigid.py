@@ -255,6 +255,38 @@ def _top(pull):
     return found[found[:, 15] > 0][:, 2].max() - RADIUS
 
 
+def test_adhesion_matters_where_a_body_leaves_and_hardly_where_it_rests():
+    """A resting body's jitter was as much of a separation as a bounce."""
+    from scipy.spatial.transform import Rotation
+
+    rng, times, pull, reach = np.random.default_rng(6), np.arange(0, 0.7, 1 / 480), 60.0, 0.004
+    rest = RADIUS * Rotation.random(12, random_state=0).as_matrix()[:, :, 0]
+    trials, paths = [], []
+    for n, height in enumerate((0.05, 0.08, 0.11)):
+        begin = state((0, 0, RADIUS + height), (0.2, 0, 0))
+        paths.append(run(scene_of(sphere()), begin, times, pull=pull, reach=reach))
+        points = paths[-1][:, None, :3] + np.einsum("tij,kj->tki", as_matrix(paths[-1][:, 3:7]), rest)
+        trials.append(
+            Trial(
+                name=f"take{n}",
+                role="fit",
+                times=times,
+                points=points + 1e-4 * rng.normal(size=points.shape),
+                pixels=None,
+                object_index=np.zeros(12, dtype=np.int64),
+                rest_points=rest,
+                predict_times=None,
+            )
+        )
+    fits = fit_rigid(scene_of(sphere(), trials).capture, ["adhesion"])
+    score = fits.discrepancy(fits.candidates[0])["take2"].frame_score
+    gap = paths[2][:, 2] - RADIUS
+    leaves, lies = (paths[2][:, 9] > 0.1) & (gap < 0.5 * reach), (times > 0.6) & (gap < 1e-4)
+    assert leaves.sum() >= 1 and lies.sum() > 10
+    assert score[leaves].min() > score[lies].max()
+    assert score[(gap > 0.01) & (times < 0.12)].max() == 0.0
+
+
 def test_a_start_sunk_into_the_ground_is_not_thrown_up():
     found = run(scene_of(box()), state((0, 0, 0.05 - 3e-4), (0.2, 0, 0)), np.linspace(0.01, 0.3, 30))
     assert found[:, 2].max() < 0.05 + 1e-4

@@ -144,7 +144,9 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
         lack -= (setting.rolling / scene.body.bound * rate)[:, None] * way
     if setting.pull > 0:
         gap = _gap(used.problem, record)
-        held = (gap < setting.reach) * (record[:, 7:10] @ normal > 0) * (1 - np.maximum(gap, 0.0) / setting.reach)
+        # A body at rest is held, too, but its jitter is no separation: where it leaves faster is where that matters.
+        away = np.maximum(record[:, 7:10] @ normal, 0.0)
+        held = (gap < setting.reach) * away / (away + REST_SPEED) * (1 - np.maximum(gap, 0.0) / setting.reach)
         lack -= (_by_frame(held[:, None], nearest, frames) * setting.pull) * normal
     if setting.fraction > 0:
         arm = np.einsum("fij,j->fi", as_matrix(record[:, 3:7]), setting.center)
