@@ -33,6 +33,7 @@ from .mask_proposals import (
     without_notches,
 )
 from .outer_rim import outer_rim
+from .plain_backdrop import missing_parts, plain_backdrop
 from .strokes import Strokes, no_strokes
 
 Mask = NDArray[np.bool_]
@@ -191,6 +192,13 @@ def segment(
         rim = outer_rim(crop, found, taken | drop)
         if rim.any():
             found = settle_outline(crop, found | rim)
+        backdrop = plain_backdrop(pixels)
+        if backdrop is not None:
+            lacking = missing_parts(pixels, _at(found, pixels.shape, left, top), box, backdrop)
+            lacking = lacking[top:bottom, left:right] & ~taken & ~drop & ~gaps
+            if lacking.any():
+                beside = cv2.dilate(lacking.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+                found = np.where(beside, settle_outline(crop, found | lacking), found)
     found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep)) & ~gaps
     if keep.any():
         # Between what is kept and the rest their mixed colours look like a third one: bridge the groove.
@@ -201,8 +209,7 @@ def segment(
     found = (smooth_outline(found) | keep | _thin_parts(found)) & ~taken & ~drop
     found[:, : inner[0]] = found[: inner[1]] = False
     found[:, inner[2] :] = found[inner[3] :] = False
-    mask = np.zeros((height, width), dtype=bool)
-    mask[top:bottom, left:right] = _kept_part(found, taken, keep)
+    mask = _at(_kept_part(found, taken, keep), pixels.shape, left, top)
     if mask.sum() < MIN_AREA:
         raise InputError(f"{where}: nothing was found in the box; draw it closer around the object")
     for notice in notices:
@@ -215,6 +222,13 @@ def segment(
             "and its size and foot are guesses"
         )
     return mask
+
+
+def _at(part: Mask, shape: tuple[int, ...], left: int, top: int) -> Mask:
+    """``part`` (h, w) of a picture of the given ``shape``, at its place."""
+    whole = np.zeros(shape[:2], dtype=bool)
+    whole[top : top + part.shape[0], left : left + part.shape[1]] = part
+    return whole
 
 
 def _kept_part(mask: Mask, others: Mask, keep: Mask) -> Mask:

@@ -24,6 +24,7 @@ from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
 from .outline_sharpness import in_focus
+from .plain_backdrop import things_before_backdrop
 from .proposal_features import (
     FEATURES,
     Mask,
@@ -76,8 +77,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     """Return at most ``most`` objects of ``pixels`` (H, W, 3), best first; boxes in its own pixels.
 
     Each box holds one whole object, not a group, a part, or an object with ground (``whole_objects``). Where one is
-    sharp, those out of focus are left out; specks beside it and what the photo cuts come last. The list is empty where
-    nothing stands out.
+    sharp, those out of focus are left out; specks beside it and what the photo cuts come last. Before a plain backdrop
+    the things on it come first. The list is empty where nothing stands out.
     """
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
@@ -97,7 +98,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
         x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
-    return result
+    return with_model(things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)
 
 
 def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float]) -> list[float]:

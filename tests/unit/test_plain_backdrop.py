@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Things before white paper and studio backdrops: found whole, and with what colour alone would leave behind."""
+
+import cv2
+import numpy as np
+import pytest
+from physgen.sim.reconstruct.reconstruct_options import Proposal
+from physgen.sim.reconstruct.segmentation.box_segmentation import segment
+from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
+from physgen.sim.reconstruct.segmentation.plain_backdrop import missing_parts, plain_backdrop, things_before_backdrop
+
+HEIGHT, WIDTH = 240, 320
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+WHITE = (252, 252, 252)
+
+
+def ellipse(x, y, across, down):
+    return ((COLUMNS - x) / across) ** 2 + ((ROWS - y) / down) ** 2 < 1
+
+
+def sweep():
+    """A studio's grey sweep: a wall that grows darker, a paler floor, and a soft edge between them."""
+    floor = 1.0 / (1.0 + np.exp(-(ROWS - 170.0) / 12.0))
+    return (150.0 + 45.0 * floor - 0.05 * COLUMNS)[..., None] * np.array([1.0, 1.0, 0.99])
+
+
+def photo(background, things, seed=0):
+    """``background`` (H, W, 3) or a colour with ``things`` (mask, colour) on it, blurred and noisy as by a camera."""
+    picture = np.broadcast_to(np.asarray(background, float), (HEIGHT, WIDTH, 3)).copy()
+    for mask, colour in things:
+        picture[mask] = colour
+    noise = np.random.default_rng(seed).normal(0.0, 1.0, picture.shape)
+    return np.clip(cv2.GaussianBlur(picture, (0, 0), 0.8) + noise, 0, 255).astype(np.uint8)
+
+
+def soft_shadow(background, x, y):
+    """``background`` with a soft shadow around (x, y)."""
+    depth = 0.5 * np.exp(-(((COLUMNS - x) / 60.0) ** 2) - ((ROWS - y) / 14.0) ** 2)
+    return np.broadcast_to(np.asarray(background, float), (HEIGHT, WIDTH, 3)) * (1.0 - depth)[..., None]
+
+
+def holds(box, mask):
+    """Whether ``box`` is a loose one around all of ``mask``, and around little more."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    x0, y0, x1, y1 = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+    around = box[0] <= x0 and box[1] <= y0 and box[2] >= x1 and box[3] >= y1
+    return around and (box[2] - box[0]) * (box[3] - box[1]) < 1.6 * (x1 - x0) * (y1 - y0)
+
+
+BODY, HEAD = ellipse(160, 150, 55, 60), ellipse(160, 75, 70, 45)
+TOY = BODY | HEAD
+
+
+def toy(background=WHITE):
+    """A plush toy: its pale face and its dark band stand out from it more than some of it does from the page."""
+    things = [(BODY, (120, 190, 200)), (HEAD, (60, 170, 190)), (ellipse(160, 88, 40, 24), (245, 205, 185))]
+    return photo(background, [*things, (ellipse(160, 150, 25, 12), (40, 40, 50))])
+
+
+@pytest.mark.parametrize("background", [WHITE, sweep(), soft_shadow(WHITE, 160, 212)], ids=["white", "studio", "shade"])
+def test_a_thing_before_a_backdrop_is_found_whole_not_as_its_face(background):
+    found = propose_boxes(toy(background))
+    assert holds(found[0].box, TOY)
+    assert all(item.score < 0.8 for item in found[1:])
+
+
+def test_a_tiled_wall_and_a_room_are_no_backdrop():
+    tiles = np.where(((ROWS // 24 + COLUMNS // 24) % 2)[..., None] > 0, 200.0, 150.0) * np.ones(3)
+    assert plain_backdrop(toy(tiles)) is None
+    grain = cv2.GaussianBlur(np.random.default_rng(1).normal(150.0, 60.0, (HEIGHT, WIDTH)), (0, 0), 1.0)
+    assert plain_backdrop(toy(grain[..., None] * np.ones(3))) is None
+    assert things_before_backdrop(toy(tiles), []) == []
+
+
+def test_sweets_that_touch_are_told_apart_and_crumbs_are_none():
+    sweets = [ellipse(x, 120, 26, 26) for x in (80, 130, 180)]
+    colours = [(200, 40, 30), (30, 60, 190), (240, 200, 40)]
+    picture = photo(WHITE, [*zip(sweets, colours, strict=True), (ellipse(280, 40, 5, 5), (30, 30, 30))])
+    boxes = [Proposal((float(x - 28), 92.0, float(x + 28), 148.0), 0.9) for x in (80, 130, 180)]
+    assert things_before_backdrop(picture, boxes) == boxes
+    # Without them it is one contour.
+    (one,) = things_before_backdrop(picture, [])
+    assert holds(one.box, np.logical_or.reduce(sweets))
+
+
+def test_a_thing_that_fills_the_photo_has_a_box_within_it():
+    tall = ellipse(160, 120, 152, 112)
+    picture = photo(WHITE, [(tall, (60, 90, 160))])
+    (one,) = things_before_backdrop(picture, [])
+    x0, y0, x1, y1 = (int(v) for v in one.box)
+    assert (x1 - x0) * (y1 - y0) < 0.98 * WIDTH * HEIGHT
+    mask = segment(picture, (x0, y0, x1, y1), "thing")
+    assert (mask & tall).sum() > 0.95 * (mask | tall).sum()
+
+
+EAR = ellipse(110, 45, 16, 26)
+SHADOW = ellipse(225, 205, 60, 9) & ~TOY
+
+
+def lacking(ear, shadow=(90, 90, 90), box=(60, 5, 300, 225)):
+    """What a mask without the ear lacks before a grey sweep with a hard shadow."""
+    picture = photo(sweep(), [(SHADOW, shadow), (EAR, ear), (TOY, (200, 110, 40))])
+    return missing_parts(picture, TOY, box, plain_backdrop(picture))
+
+
+@pytest.mark.parametrize("ear", [(45, 42, 40), (95, 95, 95), (235, 235, 235)], ids=["black", "grey", "white"])
+def test_an_ear_of_the_backdrops_shade_is_added_and_its_shadow_is_not(ear):
+    added, part = lacking(ear), EAR & ~TOY
+    assert (added & part).sum() > 0.9 * part.sum()
+    assert (added & ~cv2.dilate(part.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)).sum() == 0
+
+
+def test_a_coloured_foot_is_added_and_what_leaves_the_box_is_not():
+    assert (lacking((45, 42, 40), shadow=(40, 60, 160)) & SHADOW).sum() > 0.8 * SHADOW.sum()
+    assert not (lacking((45, 42, 40), shadow=(40, 60, 160), box=(60, 5, 260, 225)) & SHADOW).any()
+
+
+def test_a_mask_that_lacks_nothing_is_left_alone():
+    picture = photo(sweep(), [(TOY, (200, 110, 40))])
+    assert not missing_parts(picture, TOY, (60, 5, 300, 225), plain_backdrop(picture)).any()
