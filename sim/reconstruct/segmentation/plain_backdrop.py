@@ -52,7 +52,7 @@ ALIKE, OVERLAP, COVERED, FEWEST = 4.0, 0.25, 0.7, 3
 """Sweets that touch are one contour, and so is a toy. They are told apart by the boxes of what stands out by itself
 where these are of one size, up to this factor in area, overlap by less than this share of the smaller, cover more than
 this share of the contour, and are that many at least."""
-UNLIKE = 8.0
+UNLIKE = 5.0
 """Distance in CIELAB from the backdrop of a part that an outline lacks."""
 SEAM = 3.0
 """Pixels of the copy: what lies that near an outline is part of it, and thinner parts are its border."""
@@ -127,7 +127,7 @@ def _holding(
         return None
     best = int(np.argmax(shares))
     rest = thing & ~windows[best]
-    if windows[best].mean() > FULL or (shares[best] < WHOLE and _unlike_shade(lab[rest], behind[rest])):
+    if windows[best].mean() > FULL or (shares[best] < WHOLE and _shaded(lab[rest], behind[rest]).mean() < 0.5):
         return None
     return replace(parts[best], score=max(parts[best].score, SCORE))
 
@@ -144,7 +144,7 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     (h, w) of the photo ``pixels`` (H, W, 3).
 
     A part touches the mask, is thicker than the outline may be off, ends within the box, and is unlike the backdrop
-    beside it. Near the object's foot it must not have the colour of its shade either.
+    beside it; near the object's foot also unlike its shade.
     """
     nothing = np.zeros_like(mask)
     size = backdrop.shape[::-1]
@@ -155,7 +155,10 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
         return nothing
     lab = _lab(_copy(pixels))
     behind = _behind(lab, backdrop)
-    unlike = np.linalg.norm(lab - behind, axis=-1) > UNLIKE
+    foot = rows[-1] - FOOT * (rows[-1] - rows[0])
+    below = (np.arange(len(own)) > foot)[:, None]
+    shade = cv2.morphologyEx((_shaded(lab, behind) & below).astype(np.uint8), cv2.MORPH_OPEN, _disc(PASS)) > 0
+    unlike = (np.linalg.norm(lab - behind, axis=-1) > UNLIKE) & ~shade
     near = cv2.dilate(own.astype(np.uint8), _disc(SEAM)) > 0
     parts = cv2.morphologyEx((~backdrop & ~own & unlike).astype(np.uint8), cv2.MORPH_OPEN, _disc(SEAM)) > 0
     parts = touching(parts, near)
@@ -164,21 +167,18 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     within[y0 + 1 if y0 else 0 : y1 - 1 if y1 < len(mask) else y1,
            x0 + 1 if x0 else 0 : x1 - 1 if x1 < mask.shape[1] else x1] = True  # fmt: skip
     inside = cv2.resize(within.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-    foot = rows[-1] - FOOT * (rows[-1] - rows[0])
     count, labels, stats, _ = cv2.connectedComponentsWithStats(parts.astype(np.uint8), connectivity=8)
     kept = np.zeros_like(own)
     for index in range(1, count):
         part = labels == index
         if stats[index, cv2.CC_STAT_AREA] < LEAST_PART * own.sum() or (part & ~inside).any():
             continue
-        lowest = stats[index, cv2.CC_STAT_TOP] + stats[index, cv2.CC_STAT_HEIGHT]
-        if lowest < foot or _unlike_shade(lab[part], behind[part]):
-            kept |= part
+        kept |= part
     if not kept.any():
         return nothing
     # The seam between them is the object's, too.
     joined = cv2.morphologyEx((own | kept).astype(np.uint8), cv2.MORPH_CLOSE, _disc(SEAM)) > 0
-    added = joined & ~own & (cv2.dilate(kept.astype(np.uint8), _disc(SEAM)) > 0) & (~backdrop | kept)
+    added = joined & ~own & ~shade & (cv2.dilate(kept.astype(np.uint8), _disc(SEAM)) > 0) & (~backdrop | kept)
     full = cv2.resize(added.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
     reach = round(SEAM * max(across, down)) + 1
     beside = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
@@ -192,12 +192,12 @@ def _thin_between(mask: Mask, part: Mask, reach: int) -> Mask:
     return np.asarray((cv2.morphologyEx(((mask & near) | part).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0) & near)
 
 
-def _unlike_shade(colours: NDArray[np.float32], behind: NDArray[np.float32]) -> bool:
-    """Whether ``colours`` (n, 3) are not those of the backdrop ``behind`` them (n, 3), CIELAB, in its own shade."""
-    factor = (colours[:, :1] + 16.0) / (behind[:, :1] + 16.0)
-    # Darker paint scales chroma with the cube root of light, as lightness.
-    away = np.linalg.norm(colours[:, 1:] - factor * behind[:, 1:], axis=1)
-    return bool(np.median(factor) > 1.0 or np.median(away) > COLOURED)
+def _shaded(colours: NDArray[np.float32], behind: NDArray[np.float32]) -> Mask:
+    """Whether ``colours`` (…, 3) are those of the backdrop ``behind`` them (…, 3), CIELAB, in its own shade."""
+    factor = (colours[..., :1] + 16.0) / (behind[..., :1] + 16.0)
+    # Shade scales chroma as it does lightness, with the cube root of light.
+    away = np.linalg.norm(colours[..., 1:] - factor * behind[..., 1:], axis=-1)
+    return np.asarray((factor[..., 0] < 1.0) & (away < COLOURED))
 
 
 def _told_apart(thing: Mask, parts: Sequence[Proposal], across: float, down: float) -> list[Proposal]:
