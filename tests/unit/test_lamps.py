@@ -116,10 +116,12 @@ def test_a_soft_light_on_clipped_white_is_no_more_than_a_weak_lamp_above():
         assert lamp.share < 0.2 and lamp.direction[2] > math.sin(math.radians(70.0)) and lamp.angle > 0.4
 
 
-def test_white_without_any_shadow_says_nothing():
-    pixels, mask, mesh = photo([])
+@pytest.mark.parametrize("size", [1.0, 2.5])
+def test_white_without_any_shadow_says_nothing(size):
+    pixels, mask, (body, faces) = photo([])
     white = np.where(mask[..., None], pixels, np.uint8(255))
-    assert estimate_lamps(CAMERA, Ground(), white, [mask], [mesh]) is None
+    # A body of another size than its mask's hides other parts of the page.
+    assert estimate_lamps(CAMERA, Ground(), white, [mask], [(body * size, faces)]) is None
 
 
 def test_other_things_on_the_ground_are_no_ground():

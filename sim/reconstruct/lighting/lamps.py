@@ -44,6 +44,8 @@ WHITE_GROUND = 0.5
 it: without them only its shadows are left to be compared with each other."""
 WHITE_SHARE = 2
 """Most clipped points that are kept, over the others."""
+LEAST_SHADED = 30
+"""Fewest points of white ground that are darker, as in a shadow: a cut-out has a few along its outline."""
 LUMINANCE_F32 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
@@ -216,7 +218,8 @@ def estimate_lamps(
     many lamps at most. things: (H, W) what stands on the ground besides the objects, or None.
     """
     view = observe_ground(camera, ground, pixels, masks, meshes, sky, things)
-    if view is None:
+    if view is None or (~view.white).sum() < LEAST_SHADED:
+        # On white throughout any lamp explains the ground that stands in none of its shadow.
         return None
     search = _Search(view)
     lamps = search.first()

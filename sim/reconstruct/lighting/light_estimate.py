@@ -126,7 +126,7 @@ def estimate_light(
         scene.camera, scene.ground, scene.pixels, scene.masks, scene.meshes, sky, most=most, things=scene.things
     )
     if found is None:
-        notice("too little ground is visible to estimate the sun; it is set above, left and behind")
+        notice("too little ground is visible, or all is white, to estimate the sun; it is set above, left and behind")
         return radiance, light_with_sun(none, DEFAULT_SUN, DEFAULT_STRENGTH, DEFAULT_ANGLE)
     if not found:
         notice("no object casts a clear shadow: the light is soft, from above, without a sun (physgen light sets one)")
