@@ -245,12 +245,15 @@ def _loose(mask: Mask) -> Box:
 
 
 def _behind(lab: NDArray[np.float32], backdrop: Mask) -> NDArray[np.float32]:
-    """The backdrop's colours (h, w, 3) beside each pixel, from the nearest scale that sees some of it."""
+    """The backdrop's colours (h, w, 3) beside each pixel, from the nearest scale that sees some of it.
+
+    Sideways from farther off: a floor meets a wall along a level line.
+    """
     total = np.zeros_like(lab)
     weight = np.full(backdrop.shape, 1e-9, dtype=np.float32)
-    for share, sigma in ((1.0, 6.0), (1e-3, 24.0), (1e-6, 96.0)):
-        weight += share * cv2.GaussianBlur(backdrop.astype(np.float32), (0, 0), sigma)
-        total += share * cv2.GaussianBlur(lab * backdrop[..., None], (0, 0), sigma)
+    for share, across, down in ((1.0, 6.0, 6.0), (1e-3, 48.0, 6.0), (1e-6, 96.0, 96.0)):
+        weight += share * cv2.GaussianBlur(backdrop.astype(np.float32), (0, 0), across, sigmaY=down)
+        total += share * cv2.GaussianBlur(lab * backdrop[..., None], (0, 0), across, sigmaY=down)
     return np.asarray(total / weight[..., None], dtype=np.float32)
 
 
