@@ -171,3 +171,19 @@ def test_an_edge_beside_a_small_thing_only_does_not_pass_behind_a_large_one(star
     hidden[80:260, 60:200] = hidden[160:240, 330:400] = True
     found = edges_behind(logs, hidden, hidden)
     assert [round(edge.c) for edge in found] == ([200] if start == 0 else [])
+
+
+@pytest.mark.parametrize("white", [True, False], ids=["white", "studio"])
+def test_behind_a_thing_a_plain_backdrop_goes_on_without_a_stain_or_an_edge(white):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    floor = 1.0 / (1.0 + np.exp(-(rows - 0.7 * HEIGHT) / (0.08 * HEIGHT)))
+    level = np.full((HEIGHT, WIDTH), 253.0) if white else 150.0 + 45.0 * floor
+    truth = level[..., None] + np.random.default_rng(3).normal(0.0, 0.8, (HEIGHT, WIDTH, 3))
+    x, y = 0.5 * WIDTH, 0.8 * HEIGHT
+    shade = 0.5 * np.exp(-(((columns - x) / (0.2 * WIDTH)) ** 2) - ((rows - y) / (0.06 * HEIGHT)) ** 2)
+    thing = disc(x, 0.55 * HEIGHT, 0.25 * HEIGHT)
+    picture = np.where(thing[..., None], (60.0, 170.0, 190.0), truth * (1.0 - shade)[..., None])
+    picture = np.clip(cv2.GaussianBlur(picture, (0, 0), 0.8), 0, 255).astype(np.uint8)
+    hole = cv2.dilate((thing | (shade > 0.02)).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    filled = fill_background(picture, hole, thing, camera(20.0))
+    assert decibels(filled, np.clip(truth, 0, 255), hole) > 36.0

@@ -82,6 +82,14 @@ def iou(box, other):
     return common / (sum((b[2] - b[0]) * (b[3] - b[1]) for b in (box, other)) - common)
 
 
+def test_a_thing_that_nearly_fills_the_photo_gets_a_box_with_some_of_the_photo_around_it():
+    alpha = np.zeros((HEIGHT, WIDTH))
+    alpha[8:-8, 8:-8] = 1.0
+    (x0, y0, x1, y1) = proposals_from_alpha(alpha)[0].box
+    assert (x1 - x0) * (y1 - y0) < 0.98 * WIDTH * HEIGHT
+    assert x0 <= 8 and y0 <= 8 and x1 >= WIDTH - 8 and y1 >= HEIGHT - 8
+
+
 def test_both_things_are_found_and_come_first_and_what_is_out_of_focus_is_not(photo, tmp_path):
     found = propose(photo, out=tmp_path / "list")
     x, y, radius = BEHIND

@@ -17,6 +17,7 @@ from scipy import ndimage
 from ...composite.inpaint import FillOptions
 from ...errors import InputError
 from ...scene.model import Camera
+from ..segmentation.plain_backdrop import plain_backdrop
 from .inpainting_methods import METHODS, InpaintingTask, MethodChoice, box, choose_method
 from .relit_ground import continued, near_any, relit, smoothed
 from .surface_edges import Edge, edges_behind
@@ -170,6 +171,9 @@ def leftover_shadow(logs: Picture, part: Mask, closed: Mask) -> Mask:
 
 Notice = Callable[[str], None]
 
+BACKDROP, BACKDROP_RIM = 0.9, (8.0, 28.0)
+"""Share of the photo around a hole that is plain backdrop, above which the hole shows nothing else; and from how far to
+how far beside it, in pixels at 1024: nearer lie the blurred outlines of what stands there."""
 SMALL = 2e-4
 """Share of the photo below which a part uses the default method without a trial."""
 SPECK = 0.02
@@ -219,13 +223,40 @@ def fill_background(
     filling = pixels.astype(np.float32)
     open_hole = hole.copy()
     shade = np.zeros_like(hole)
+    backdrop = _plain(pixels)
     for part in _parts(hole):
         # Leftover shadow outside of the hole is neither a source nor a reference level.
         dark = leftover_shadow(logarithms(filling), part, open_hole | barred)
         shade |= dark
+        closed = open_hole | barred | dark
+        if _amid(part, backdrop, closed):
+            # It has no pattern and no edge that would have to go on.
+            known = (backdrop > 0) & ~closed
+            filling = np.where(part[..., None], continued(filling, known, ~known), filling)
+            open_hole &= ~part
+            continue
         _fill_part(filling, part, open_hole, barred, dark, objects, changed, camera, options, notice)
         open_hole &= ~part
     return blend(pixels, filling, hole, objects, shade | barred)
+
+
+def _plain(pixels: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """The plain backdrop of ``pixels`` (H, W, 3): numbers (H, W) of its connected parts, 0 elsewhere."""
+    found = plain_backdrop(pixels)
+    if found is None:
+        return np.zeros(pixels.shape[:2], dtype=np.int32)
+    # Its border is mixed with what stands before it.
+    inner = cv2.erode(found.astype(np.float32), np.ones((3, 3), np.uint8))
+    large = cv2.resize(inner, pixels.shape[1::-1], interpolation=cv2.INTER_LINEAR) > 0.99
+    return np.asarray(cv2.connectedComponents(large.astype(np.uint8), connectivity=4)[1], dtype=np.int32)
+
+
+def _amid(part: Mask, backdrop: NDArray[np.int32], closed: Mask) -> bool:
+    """Whether around the hole ``part`` (H, W) there is nothing but one part of the ``backdrop``, see ``_plain``: a wall
+    and a floor with an edge between them are two. ``closed``: (H, W) what tells nothing."""
+    near, far = (max(1, round(reach * max(part.shape) / 1024)) for reach in BACKDROP_RIM)
+    beside = backdrop[_widened(part, far) & ~_widened(part, near) & ~closed]
+    return bool(len(beside) and np.bincount(beside)[1:].max(initial=0) > BACKDROP * len(beside))
 
 
 def _widened(mask: Mask, radius: int) -> Mask:

@@ -24,7 +24,7 @@ from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
 from .outline_sharpness import in_focus
-from .plain_backdrop import things_before_backdrop
+from .plain_backdrop import FULL, things_before_backdrop
 from .proposal_features import (
     FEATURES,
     Mask,
@@ -159,14 +159,15 @@ def _share_inside(box: Box, other: Box) -> float:
 
 
 def _loose(box: tuple[int, int, int, int], size: tuple[int, int]) -> Box:
+    """``box`` with a margin, a smaller one or none where it would leave nothing of a photo of ``size`` around it."""
     x0, y0, x1, y1 = box
     margin = MARGIN * max(x1 - x0, y1 - y0) + 1.0
-    return (
-        float(max(0.0, x0 - margin)),
-        float(max(0.0, y0 - margin)),
-        float(min(size[0], x1 + margin)),
-        float(min(size[1], y1 + margin)),
-    )
+    for less in (1.0, 0.5, 0.25, 0.0):
+        left, top = max(0.0, x0 - less * margin), max(0.0, y0 - less * margin)
+        right, bottom = min(float(size[0]), x1 + less * margin), min(float(size[1]), y1 + less * margin)
+        if (right - left) * (bottom - top) < FULL * size[0] * size[1]:
+            break
+    return left, top, right, bottom
 
 
 def saliency(pixels: Pixels, segments: NDArray[np.int_]) -> NDArray[np.float32]:
