@@ -29,6 +29,7 @@ from .reconstruct_options import ReconstructOptions
 from .segmentation.amodal_completion import complete_colours, complete_outline
 from .segmentation.box_segmentation import Box, segment
 from .segmentation.occlusion_order import Order, occlusion_order
+from .segmentation.plain_backdrop import remnants
 from .shape.body_texture import TexturedSurface
 from .stage_cache import Notice, StageCache, Steps
 
@@ -101,6 +102,8 @@ def separate_layers(
     )
     # Where the penumbra is known, less dilation is needed.
     share = PENUMBRA_DILATION / PAPER_DILATION if options.shadow_threshold is None else 1.0
+    beside = [thing & ~unboxed.stay for thing in remnants(pixels, seen)]
+    darkened = [shadow | thing for shadow, thing in zip(darkened, beside, strict=True)]
     holes = object_holes(seen, darkened, share * options.hole_dilation * max(pixels.shape[:2]) / 1024.0, unboxed.stay)
     return Layers(
         seen=tuple(seen),

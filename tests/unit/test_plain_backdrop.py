@@ -7,7 +7,12 @@ import pytest
 from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.box_segmentation import segment
 from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
-from physgen.sim.reconstruct.segmentation.plain_backdrop import missing_parts, plain_backdrop, things_before_backdrop
+from physgen.sim.reconstruct.segmentation.plain_backdrop import (
+    missing_parts,
+    plain_backdrop,
+    remnants,
+    things_before_backdrop,
+)
 
 HEIGHT, WIDTH = 240, 320
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
@@ -118,3 +123,15 @@ def test_a_coloured_foot_is_added_and_what_leaves_the_box_is_not():
 def test_a_mask_that_lacks_nothing_is_left_alone():
     picture = photo(sweep(), [(TOY, (200, 110, 40))])
     assert not missing_parts(picture, TOY, (60, 5, 300, 225), plain_backdrop(picture)).any()
+
+
+def test_what_a_mask_lacks_above_its_foot_leaves_with_it_and_a_stand_stays():
+    stand, ear = ellipse(160, 216, 70, 10) & ~TOY, EAR & ~TOY
+    picture = photo(sweep(), [(stand, (240, 240, 240)), (EAR, (235, 235, 235)), (TOY, (200, 110, 40))])
+    (beside,) = remnants(picture, [TOY])
+    assert (beside & ear).sum() > 0.95 * ear.sum()
+    assert not (beside & stand).any()
+    grain = photo(sweep(), [(EAR, (235, 235, 235)), (TOY, (200, 110, 40))]).astype(float)
+    grain += 20.0 * np.random.default_rng(2).normal(size=grain.shape)
+    (none,) = remnants(np.clip(grain, 0, 255).astype(np.uint8), [TOY])
+    assert not none.any()
