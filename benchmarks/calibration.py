@@ -26,7 +26,7 @@ from physgen.benchmarks.common import benchmark_parser
 from physgen.blind_check.calibration import cross_validated, judge, reliability
 from physgen.blind_check.check import plan_cases
 from physgen.blind_check.fit_records import load_records, missing_cases, record_case, save_record
-from physgen.sim.diagnose.model_comparison import ComparisonSettings
+from physgen.sim.diagnose.comparison_settings import ComparisonSettings
 from physgen.sim.errors import PhysGenError, SimulationError
 
 

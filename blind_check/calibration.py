@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim.diagnose.against_none import nominal_or_refitted
+from ..sim.diagnose.comparison_settings import ComparisonSettings
 from ..sim.diagnose.diagnosis import NONE, UNKNOWN, CandidateFit
-from ..sim.diagnose.model_comparison import ComparisonSettings, ModelComparison, compare_models, nominal_or_refitted
+from ..sim.diagnose.model_comparison import ModelComparison, compare_models
 from .fit_records import FitRecord
 from .scoring import calibration_error
 

@@ -12,10 +12,11 @@ a(m), the probability that the right candidate leaves a misfit of m (logistic in
 held-out trials better has no gain, whatever its evidence, but where bounces make them chaotic, and is never sure there;
 where one predicts them down to the noise, unknown yields to it, whatever its misfit. ``none`` is never said while the
 nominal model's held-out error is many times noise and grain (the simulator's own uncertainty), all trials together or
-each over its own, nor while what it leaves of whole trials bends as under a force that is missing: what it would get
-goes to ``unknown``. However large the evidence, a small share of every probability stays spread over all answers: for
-what no model of the errors knows of, in the search and in the models themselves. The constants were set on captures of
-known cause made by other simulators (docs/diagnosis.md).
+each over its own, nor while what it leaves of whole trials bends as under a force that is missing, nor while friction
+and restitution outside their plausible ranges explain the trials far better: what it would get goes to ``unknown``.
+However large the evidence, a small share of every probability stays spread over all answers: for what no model of the
+errors knows of, in the search and in the models themselves. The constants (``comparison_settings``) were set on
+captures of known cause made by other simulators (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -25,71 +26,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammainccinv
 
 from ..effects.registry import effects
+from .against_none import against_none, nominal_or_refitted, worsens
+from .comparison_settings import VOCABULARY, ComparisonSettings
 from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, FittedModels, Verdict
 from .report.wording import effect_label
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparisonSettings:
-    """Constants of the decision.
-
-    temperature: T above, at least 1. fee: d above, nats; where held-out trials exclude ``none``, it falls like
-        second_fee with the error that the likeliest effect leaves them.
-    predicts: fraction of the nominal model's held-out error that an effect must stay below.
-    worsens: factor on the nominal misfit, if that is above 1, from which an effect has no gain. It contains the nominal
-        model: what leaves so much more, as where its contacts are surer and wrong, explains nothing.
-    enough: misfit at which a(m) is one half for a candidate that hardly lowers the nominal misfit; enough_explained:
-        the same for one that removes most of it.
-    sharpness: slope of a(m) in ln m.
-    prior_none: prior probability that nothing is missing; the effects share the rest.
-    containing: prior of an effect that contains another one (``CONTAINING``), relative to it: numbers that the trials
-        leave open cost no evidence.
-    unseen_fee: nats that an effect pays more where it predicts held-out trials no better, and the nominal model's error
-        there is within noise and grain, so that they cannot judge; else it has no gain at all.
-    unshown: largest probability of an effect that predicts held-out trials no better; where their error grows, it is
-        divided by the same factor, and ``unknown`` gets the rest.
-    second_fee: nats that a second effect pays, beside its prior; with unseen_fee where the pair predicts held-out
-        trials no better than its better single effect.
-    clearly: fraction of the better single effect's held-out error at which a pair pays no second_fee, and of the
-        nominal model's at which effects pay no fee where ``none`` is excluded; both fall from ``predicts`` on: states
-        between contacts absorb what an effect explains there, so that the evidence hardly shows it; held-out trials,
-        predicted through their contacts, do.
-    predicted: closed fractions of the gap from which an effect begins to count, and fully counts, as an explanation.
-    many: factor on noise floor and grain together above which the nominal model's held-out error excludes ``none``.
-    chance: probability, if noise and grain are all there is, of held-out trials so far off that they exclude ``none``.
-    bends: nats of ``CandidateFit.bending`` from which ``unknown`` is likelier than ``none``: odds of 100 to 1, because
-        a slow error of another memory bends a little, too.
-    lapse: share that is spread evenly over the vocabulary, ``none`` and ``unknown``; what falls to effects that were
-        not tested goes to ``unknown``. From Laplace's rule of succession on sure verdicts (docs/measurements.md).
-    alternative: effects with at least this fraction of the verdict's probability are named as alternatives.
-    """
-
-    temperature: float = 4.0
-    fee: float = 8.0
-    predicts: float = 0.97
-    worsens: float = 2.0
-    enough: float = 1.7
-    enough_explained: float = 3.0
-    sharpness: float = 8.0
-    prior_none: float = 0.3
-    containing: float = 0.2
-    unseen_fee: float = 100.0
-    unshown: float = 0.9
-    second_fee: float = 20.0
-    clearly: float = 0.5
-    predicted: tuple[float, float] = (0.9, 0.98)
-    many: float = 3.0
-    chance: float = 0.001
-    bends: float = math.log(100.0)
-    lapse: float = 0.02
-    alternative: float = 0.1
-
-
-VOCABULARY = 19
-"""Number of effects that share the prior, whichever were tested."""
 
 TWINS: Mapping[str, tuple[str, ...]] = {
     "time_scale": ("buoyancy",),
@@ -128,7 +70,7 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
     worth = (c for c in fits.candidates if _worth_it(c, fits.candidates))
     candidates = [nominal_or_refitted(fits), *worth]
     grain = math.hypot(fits.floor_rms_m, fits.grain_rms_m)
-    against = _against_none(fits, weighing)
+    against = against_none(fits, weighing)
     weights = _weights(candidates, weighing, grain, far=against.left == 0.0)
     adequate = [
         _adequacy(c.misfit, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates
@@ -201,64 +143,6 @@ def closed_fraction(before: float, after: float, floor: float) -> float:
     return min(max((before - after) / (before - floor), -1.0), 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _AgainstNone:
-    """What the models behind ``none`` leave that speaks against it.
-
-    said: in a few words; "" if nothing does. left: factor on what ``none`` may claim.
-    """
-
-    said: str
-    left: float
-
-
-def _against_none(fits: FittedModels, weighing: ComparisonSettings) -> _AgainstNone:
-    far = _far_off(fits, weighing)
-    if far:
-        return _AgainstNone(said=far, left=0.0)
-    straight = _straight(fits, weighing)
-    bends = "" if straight >= 0.5 else "what it leaves of whole trials bends as under a missing force"
-    return _AgainstNone(said=bends, left=straight)
-
-
-def _far_off(fits: FittedModels, weighing: ComparisonSettings) -> str:
-    """Return, in a few words, that held-out trials are many times as far off as noise and grain make; "" if not."""
-    models = fits.nominal, nominal_or_refitted(fits)
-    if min(m.heldout_rms_m for m in models) > weighing.many * math.hypot(fits.floor_rms_m, fits.grain_rms_m):
-        return f"its error is more than {weighing.many:g} times noise and the simulator's own uncertainty"
-    if min(map(_surprise, models)) > _expected_surprise(models[0].heldout_trials, weighing):
-        chi = min(m.heldout_chi for m in models)
-        return f"held-out trials are {chi:.1f} times as far off as noise and the simulator's own uncertainty make each"
-    return ""
-
-
-MOST_ELSEWHERE = 3.0
-"""A trial in which the body comes to lie on another face counts at most as this many times the median one: its distance
-says that it fell the other way, not by how much the model is wrong."""
-
-
-def _surprise(fit: CandidateFit) -> float:
-    """Return the sum of squares of held-out trials, each over what noise and grain make of it."""
-    trials = np.array(fit.heldout_trials)
-    known = np.isfinite(trials)
-    away = np.array(fit.heldout_elsewhere, dtype=bool) & known if fit.heldout_elsewhere else np.zeros_like(known)
-    if known.sum() > 2:
-        trials[away] = np.minimum(trials[away], MOST_ELSEWHERE * float(np.median(trials[known])))
-    return float(np.sum(trials[known] ** 2))
-
-
-def _expected_surprise(trials: Sequence[float], weighing: ComparisonSettings) -> float:
-    """Return what ``_surprise`` exceeds with the probability ``chance``: the error of each trial is one number."""
-    known = sum(math.isfinite(t) for t in trials)
-    return 2.0 * float(gammainccinv(0.5 * known, weighing.chance)) if known else math.inf
-
-
-def _straight(fits: FittedModels, weighing: ComparisonSettings) -> float:
-    """Return the probability that what the models behind ``none`` leave is noise and tracking, by its ``bending``."""
-    least = min(fits.nominal.bending, nominal_or_refitted(fits).bending)
-    return 1.0 / (1.0 + math.expm1(min(least, 60.0)) * math.exp(-weighing.bends))
-
-
 def _predicted(fit: CandidateFit, fits: FittedModels, weighing: ComparisonSettings) -> float:
     """Return how far ``fit`` counts as an explanation because it predicts held-out trials: 0 to 1."""
     closed = closed_fraction(fits.nominal.heldout_rms_m, fit.heldout_rms_m, fits.floor_rms_m)
@@ -288,12 +172,6 @@ def _reason(
     if fit.misfit <= 1 and top is not fit:
         return f"{better} {verb} the trials better"
     return f"leaves {fit.misfit:.1f} times the noise unexplained"
-
-
-def nominal_or_refitted(fits: FittedModels) -> CandidateFit:
-    """Return the model behind ``none``: nominal, or re-fitted within its plausible ranges if that has more evidence."""
-    within = not fits.refitted.effects and fits.refitted.log_evidence > fits.nominal.log_evidence
-    return fits.refitted if within else fits.nominal
 
 
 def _singles(fit: CandidateFit, candidates: Sequence[CandidateFit]) -> list[CandidateFit]:
@@ -380,7 +258,7 @@ def _gain(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSettings
     gain = fit.log_evidence - nominal.log_evidence
     if math.isnan(gain) or not math.isfinite(fit.log_evidence):
         return -math.inf
-    if fit.misfit > weighing.worsens * max(1.0, nominal.misfit):
+    if worsens(fit, nominal, weighing):
         gain = min(gain, 0.0)
     if _left(fit, nominal) >= weighing.predicts:
         # Where bounces make held-out motion chaotic it shows nothing, and a large gain stands.

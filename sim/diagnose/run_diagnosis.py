@@ -13,7 +13,9 @@ from typing import Any
 from ..effects.registry import effects
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from .against_none import nominal_or_refitted
 from .capture import Capture
+from .comparison_settings import ComparisonSettings
 from .diagnosis import (
     NONE,
     UNKNOWN,
@@ -31,12 +33,10 @@ from .diagnosis import (
 )
 from .gap_metrics import bootstrap_interval, localise, measure_gap, negative_controls
 from .model_comparison import (
-    ComparisonSettings,
     ModelComparison,
     closed_fraction,
     compare_models,
     kind_of,
-    nominal_or_refitted,
 )
 from .provenance import provenance
 from .report.wording import effect_label, verdict_summary

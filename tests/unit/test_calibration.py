@@ -8,7 +8,7 @@ import pytest
 from physgen.blind_check.calibration import chance_errors, cross_validated, judge, pair_gain, reliability
 from physgen.blind_check.check import plan_cases
 from physgen.blind_check.fit_records import FORMAT, load_records, missing_cases, save_record
-from physgen.sim.diagnose.model_comparison import ComparisonSettings
+from physgen.sim.diagnose.comparison_settings import ComparisonSettings
 from physgen.sim.errors import InputError
 
 

@@ -9,7 +9,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
-from physgen.sim.diagnose.model_comparison import ComparisonSettings, compare_models
+from physgen.sim.diagnose.comparison_settings import ComparisonSettings
+from physgen.sim.diagnose.model_comparison import compare_models
 from physgen.sim.diagnose.rigid import fit_rigid
 from physgen.sim.diagnose.rigid.bending import shape_scores
 from physgen.sim.diagnose.rigid.observed_poses import LEFT, observe_body
