@@ -115,7 +115,7 @@ def at_rest(folder: Scene, notice: Callable[[str], None]) -> SceneModel:
     scene = Scene(root=folder.root, model=dataclasses.replace(model, objects=calm))
     try:
         meshes = [load_object_mesh(scene, item) for item in calm]
-        prepared = prepare_world(scene, meshes, BakeOptions(frames=2, quality=COARSEST))
+        prepared = prepare_world(scene, meshes, BakeOptions(frames=2, quality=COARSEST), check_surfaces=False)
     except InputError:
         return model
     sleepers = Sleepers(prepared.setup, prepared.solver.cell_size(prepared.similarity))

@@ -19,6 +19,7 @@ from ..atomic import recover, write_json
 from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..memory import freed_memory_kept
 from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.adapters.adapter_registry import chosen_segmenter, spec_files
 from ..reconstruct.adapters.protocols import STAGES
@@ -147,9 +148,19 @@ def _reconstruct_cached(
         write_json(folder.root / STAMP_FILE, record)
         return settle(folder)
 
-    folder = reconstruct_photo(
-        photo, objects, out, options, on_event, cancelled, ask=ask, answered=answered, at_rest=at_rest, settle=stamped
-    )
+    with freed_memory_kept():
+        folder = reconstruct_photo(
+            photo,
+            objects,
+            out,
+            options,
+            on_event,
+            cancelled,
+            ask=ask,
+            answered=answered,
+            at_rest=at_rest,
+            settle=stamped,
+        )
     made = read_stamp(out)
     if made is not None:
         # What this user's own command wrote needs no further word of theirs.

@@ -215,12 +215,18 @@ class PreparedWorld:
 
 
 def prepare_world(
-    folder: Scene, meshes: Sequence[ObjectMesh], options: BakeOptions, quality: Quality | None = None
+    folder: Scene,
+    meshes: Sequence[ObjectMesh],
+    options: BakeOptions,
+    quality: Quality | None = None,
+    *,
+    check_surfaces: bool = True,
 ) -> PreparedWorld:
     """Return the world of the scene in ``folder``, whose objects have ``meshes``.
 
     quality: in place of the preset that ``options`` name. What depends on a mesh alone is worked out once for each of
-    ``meshes``, as long as the caller keeps it.
+    ``meshes``, as long as the caller keeps it. check_surfaces: warn of meshes that are simulated, but not as they are
+    meant; finding them takes longer than all the rest.
 
     Bodies that share space at the start are simulated without what they share; the warnings say so. Raises InputError
     for a scene in which nothing moves, for meshes that cannot be filled or hit, for bodies that stand in the ground,
@@ -239,7 +245,8 @@ def prepare_world(
     cell, spacing = solver.cell_size(similarity), solver.particle_spacing(similarity)
     for item, mesh in zip(scene.objects, meshes, strict=True):
         deforms = item.role == "dynamic" and cohesion_of(item.material.law) == SHAPED
-        warnings += _surface_warnings(mesh, item.name, cell, deforms)
+        if check_surfaces:
+            warnings += _surface_warnings(mesh, item.name, cell, deforms)
     if scene.ground is not None:
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)

@@ -63,6 +63,30 @@ def test_what_was_freed_between_pieces_in_use_goes_back_to_the_system():
     assert kept > 0.9 and left < 0.1, (kept, left)
 
 
+REUSED = """
+import numpy as np
+from physgen.sim.memory import freed_memory_kept
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1])
+
+before = resident()
+with freed_memory_kept():
+    large = np.ones(5_000_000)
+    taken = resident() - before
+    del large
+    kept = resident() - before
+print(kept / taken, (resident() - before) / taken)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux") or not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc")
+def test_large_arrays_stay_with_the_process_for_the_next_ones_and_go_back_at_the_end():
+    done = subprocess.run([sys.executable, "-c", REUSED], capture_output=True, text=True, check=True)
+    kept, left = map(float, done.stdout.split())
+    assert kept > 0.9 and left < 0.1, (kept, left)
+
+
 def test_memory_on_linux_is_what_the_system_calls_available(tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 16 kB\nMemAvailable:    8000 kB\n")
     assert memory._linux_memory(tmp_path / "meminfo") == 8000 * 1024

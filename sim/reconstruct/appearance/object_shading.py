@@ -350,23 +350,31 @@ def sun_lobe(
     alpha = max(roughness, LEAST_ROUGHNESS) ** 2
     if disc is None:
         disc = sun_points(scene)
-    facing = np.maximum((normals * views).sum(axis=1), 1e-3)
+    # One array a component: rows of three are slow.
+    n, v = np.ascontiguousarray(normals.T), np.ascontiguousarray(views.T)
+    facing = np.maximum(_dot(n, v), 1e-3)
     result = np.zeros(len(normals))
     for light in disc:
         lit = np.maximum(normals @ light, 0.0)
-        half = views + light
-        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
-        straight = np.clip((normals * half).sum(axis=1), 0.0, 1.0)
+        half = v + light[:, None]
+        half /= np.maximum(np.sqrt(_dot(half, half)), 1e-9)
+        straight = np.clip(_dot(n, half), 0.0, 1.0)
         # 1 - cos² loses precision for a sharp lobe, so compute the sine by the cross product.
-        sine2 = (np.cross(normals, half) ** 2).sum(axis=1)
+        across = np.stack([n[i] * half[j] - n[j] * half[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+        sine2 = _dot(across, across)
         spread = alpha**2 / (np.pi * (sine2 + alpha**2 * straight**2) ** 2 + 1e-30)
         smith = lit * np.sqrt(facing**2 * (1 - alpha**2) + alpha**2) + facing * np.sqrt(
             lit**2 * (1 - alpha**2) + alpha**2
         )
-        fresnel = f0 + (1.0 - f0) * (1.0 - np.clip((views * half).sum(axis=1), 0.0, 1.0)) ** 5
+        fresnel = f0 + (1.0 - f0) * (1.0 - np.clip(_dot(v, half), 0.0, 1.0)) ** 5
         # D F G / (4 n·l n·v) times n·l, with G / (4 n·l n·v) = 1 / (2 smith); π for brightness from irradiance over π.
         result += np.where(lit > 0, spread * fresnel * 0.5 / np.maximum(smith, 1e-9) * lit, 0.0)
     return result * (np.pi * scene.sun_radiance / len(disc))
+
+
+def _dot(first: Points, second: Points) -> NDArray[np.float64]:
+    """Inner products (N,) of the columns of ``first`` and ``second``, both (3, N)."""
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
 def sky_lobe(

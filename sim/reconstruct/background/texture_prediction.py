@@ -162,8 +162,14 @@ def _solve(
     seen = known.astype(np.float32)
     least = noise[:, None, None]
 
+    scale = np.float32(1.0 / (size[0] * size[1]))
+
     def convolved(value: Picture, kernel: NDArray[np.float32]) -> Picture:
-        return np.asarray(fft.irfft2(fft.rfft2(value, size) * kernel, size)[:, :height, :width], dtype=np.float32)
+        # Axis by axis: rows of padding are 0 before, and are not needed after.
+        image = fft.fft(fft.rfft(value, size[1], axis=2), size[0], axis=1, overwrite_x=True)
+        image *= kernel
+        rows = fft.ifft(image, axis=1, norm="forward", overwrite_x=True)[:, :height]
+        return np.asarray(scale * fft.irfft(rows, size[1], axis=2, norm="forward")[..., :width], dtype=np.float32)
 
     def inner(first: Picture, second: Picture) -> NDArray[np.float32]:
         total = np.einsum("chw,chw->c", first, second, dtype=np.float64)
@@ -171,19 +177,23 @@ def _solve(
 
     weights = np.zeros_like(planes)
     rest = planes * seen
-    direction = rest
+    direction = rest.copy()
     gain = inner(rest, rest)
     enough = CLOSE_ENOUGH**2 * np.maximum(gain, 1e-20)
     # No preconditioner: the large, regular part of the pattern converges first, and early stopping damps what
     # the data hardly determine.
     for _ in range(ROUNDS):
-        image = seen * convolved(direction, spectrum) + least * direction
+        image = convolved(direction, spectrum)
+        image *= seen
+        image += least * direction
         length = gain / np.maximum(inner(direction, image), 1e-30)
-        weights = weights + length * direction
-        rest = rest - length * image
+        weights += length * direction
+        image *= length
+        rest -= image
         following = inner(rest, rest)
         if (following < enough).all():
             break
-        direction = rest + following / np.maximum(gain, 1e-30) * direction
+        direction *= following / np.maximum(gain, 1e-30)
+        direction += rest
         gain = following
     return convolved(weights, spectrum)

@@ -83,11 +83,12 @@ def find_legs(mask: Mask, widest: float, longest: float) -> list[Leg]:
     as long as wide."""
     lowest = np.where(mask.any(axis=0), mask.shape[0] - 1 - np.argmax(mask[::-1], axis=0), -1)
     legs: list[Leg] = []
+    starts, ends = _runs(mask)
     taken = np.zeros(mask.shape[1], dtype=bool)
     for column in np.argsort(-lowest, kind="stable"):
         if lowest[column] < 0 or taken[column]:
             continue
-        leg = _leg(mask, int(column), int(lowest[column]), widest)
+        leg = _leg(mask, starts, ends, int(column), int(lowest[column]), widest)
         if leg is None:
             taken[column] = True
             continue
@@ -99,23 +100,32 @@ def find_legs(mask: Mask, widest: float, longest: float) -> list[Leg]:
     return sorted(legs, key=lambda leg: float(leg.foot[0]))
 
 
-def _leg(mask: Mask, column: int, bottom: int, widest: float) -> Leg | None:
-    """The run of ``mask`` upwards from its lower end at ``column``, ``bottom``; None if it is wider than ``widest``."""
+def _runs(mask: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First column of the run of each pixel of ``mask`` (h, w) in its row, and the column after its last."""
+    columns = np.arange(mask.shape[1])
+    starts = np.maximum.accumulate(np.where(mask, 0, columns + 1), axis=1)
+    ends = np.minimum.accumulate(np.where(mask, mask.shape[1], columns)[:, ::-1], axis=1)[:, ::-1]
+    return starts, ends
+
+
+def _leg(
+    mask: Mask, starts: NDArray[np.intp], ends: NDArray[np.intp], column: int, bottom: int, widest: float
+) -> Leg | None:
+    """The run of ``mask`` upwards from its lower end at ``column``, ``bottom``; None if it is wider than ``widest``.
+
+    starts, ends: of ``_runs``.
+    """
     rows: list[int] = []
     left: list[int] = []
     right: list[int] = []
     low, high = column, column + 1
     beside, own = 0, 0.0
     for row in range(bottom, -1, -1):
-        line = mask[row]
-        inside = np.flatnonzero(line[low:high])
+        inside = mask[row, low:high].nonzero()[0]
         if not len(inside):
             break
         at = low + int(inside[len(inside) // 2])
-        gaps = np.flatnonzero(~line[:at])
-        start = int(gaps[-1]) + 1 if len(gaps) else 0
-        gaps = np.flatnonzero(~line[at:])
-        end = at + int(gaps[0]) if len(gaps) else len(line)
+        start, end = int(starts[row, at]), int(ends[row, at])
         # A foot that is seen at a slant grows to its width first.
         if len(rows) >= 6 and len(rows) >= FOOT * (right[-1] - left[-1]):
             if own == 0.0 or len(rows) < 12 or len(rows) % 8 == 0:
