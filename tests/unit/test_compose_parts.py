@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.gaussians.compose.compose_options import ComposeOptions
-from physgen.sim.gaussians.compose.composition import MAX_STEP, StepScale, scaled_reference
+from physgen.sim.gaussians.compose.composition import AGREEMENT_GAIN, MAX_STEP, StepScale, scaled_reference
 from physgen.sim.gaussians.compose.composition_parts import Reference
 from physgen.sim.gaussians.views.posed_images import orbit_cameras
 
@@ -48,6 +48,30 @@ def test_the_factor_is_kept_and_fades():
     np.testing.assert_allclose(np.linalg.norm(far, axis=1), MAX_STEP)
     np.testing.assert_array_equal(StepScale(first=0.0, last=1.0, steps=3).steps_down(gradients, 0), 0.0)
     np.testing.assert_array_equal(rate.steps_down(0 * gradients, 3), 0.0)
+
+
+def test_steps_grow_while_they_agree_and_shrink_while_they_swing():
+    gradients = np.random.default_rng(0).normal(size=(40, 3))
+    rate = StepScale(first=0.1, last=1.0, steps=40, adapts=True)
+    lengths = [np.linalg.norm(rate.steps_down(gradients, step)) for step in range(8)]
+    ratios = np.array(lengths) / lengths[0]
+    # The fastest of them reach their bound of four first steps before the others do.
+    np.testing.assert_allclose(ratios[:5], np.exp(AGREEMENT_GAIN * np.arange(5)), rtol=1e-3)
+    assert MAX_STEP - 0.1 < ratios[-1] <= MAX_STEP
+    swinging = StepScale(first=0.1, last=1.0, steps=40, adapts=True)
+    lengths = [np.linalg.norm(swinging.steps_down((-1) ** step * gradients, step)) for step in range(8)]
+    np.testing.assert_allclose(lengths / lengths[0], np.exp(-AGREEMENT_GAIN * np.arange(8)), rtol=1e-9)
+
+
+@given(st.floats(1e-9, 1e9), st.integers(0, 2**32 - 1))
+def test_adapted_steps_do_not_depend_on_the_unit_of_the_loss(unit, seed):
+    random = np.random.default_rng(seed)
+    gradients = [random.normal(size=(30, 3)), np.zeros((30, 3)), *random.normal(size=(4, 30, 3))]
+    one, other = (StepScale(first=0.1, last=0.5, steps=6, adapts=True) for _ in range(2))
+    for step, gradient in enumerate(gradients):
+        np.testing.assert_allclose(
+            other.steps_down(unit * gradient, step), one.steps_down(gradient, step), rtol=1e-6, atol=1e-12
+        )
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -46,7 +46,8 @@ class ComposeOptions:
 
     first_move: float = quantity(1.0, 0.01, 4)
     """Displacement in grid cells of the fastest hundredth of the points in the first step, without interaction, 0.01 to
-    4. It fixes the factor between gradient and velocity (which decays by ``last_rate``)."""
+    4. It sets the first factor between gradient and velocity, which decays by ``last_rate`` and, with method pse-sds,
+    follows how well successive steps agree."""
 
     last_rate: float = quantity(0.3, 0.001, 1)
     """Decay of that factor until the last step, 0.001 to 1: the gradient of an L1 loss does not vanish by itself."""
