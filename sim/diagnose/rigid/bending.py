@@ -15,7 +15,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit, solve
-from .observed_poses import SLOW_ERROR, TOGETHER, ObservedBody
+from .observed_poses import QUATERNION, SLOW_ERROR, TOGETHER, ObservedBody
 from .shooting_problem import Segment
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def _segment_scores(seen: ObservedBody, segment: Segment) -> Array:
     frames = segment.frames[there]
     if len(frames) < LEAST_FRAMES or not seen.white > 0:
         return np.zeros((len(SLOW), len(MISSING)))
-    off = seen.residuals(segment.record[there, :3], segment.record[there, 3:7], frames)[0][:, 0] * seen.sigma
+    off = seen.residuals(segment.record[there, :3], segment.record[there, QUATERNION], frames)[0][:, 0] * seen.sigma
     reach = float(np.linalg.norm(np.ptp(seen.seen[known, 0], axis=0)))
     return shape_scores(seen.times[frames], off[:, seen.measured], seen.white, reach, float(np.ptp(seen.times)))
 

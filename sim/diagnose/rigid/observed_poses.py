@@ -19,6 +19,11 @@ from ..capture import Camera, Capture, Trial
 
 Array = NDArray[np.float64]
 
+QUATERNION, VELOCITY, SPIN, CONTACT = slice(3, 7), slice(7, 10), slice(10, 13), slice(13, 17)
+"""Columns of a state (..., 13) and of a record (..., 17) behind its position in m: quaternion (w first), velocity in
+m/s, spin in rad/s; of a record also, added up over all contacts since its start, the normal impulse per mass in m/s,
+that of friction, and the times in contact and sliding in s."""
+
 LEVEL_SHARE, LEVEL_ANGLE, LEAST_TURN = 0.1, 0.1, 0.3
 """A body slides on a face where its height changes by at most this share of its size, and its upright by this angle in
 rad; from this turn in rad on it tells where that face carries."""
@@ -81,7 +86,7 @@ def perturbed(states: Array, change: Array) -> Array:
     return np.concatenate(
         [
             states[..., :3] + change[..., :3],
-            multiply(from_rotvec(change[..., 3:6]), states[..., 3:7]),
+            multiply(from_rotvec(change[..., 3:6]), states[..., QUATERNION]),
             states[..., 7:13] + change[..., 6:12],
         ],
         axis=-1,
@@ -90,7 +95,7 @@ def perturbed(states: Array, change: Array) -> Array:
 
 def state_difference(a: Array, b: Array) -> Array:
     """Return the change (..., 12) from states ``a`` to states ``b``."""
-    turn = as_rotvec(multiply(b[..., 3:7], conjugate(a[..., 3:7])))
+    turn = as_rotvec(multiply(b[..., QUATERNION], conjugate(a[..., QUATERNION])))
     return np.concatenate([b[..., :3] - a[..., :3], turn, b[..., 7:13] - a[..., 7:13]], axis=-1)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
-from .observed_poses import ObservedBody, as_matrix, frame_pose, from_rotvec, multiply
+from .observed_poses import QUATERNION, ObservedBody, as_matrix, frame_pose, from_rotvec, multiply
 from .rigid_candidates import BodyScene
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ def _quaternion(matrix: Array) -> Array:
 def height(scene: BodyScene, state: Array) -> tuple[float, Array]:
     """Return the height of the lowest point in m and its gradient (6,) with translation and rotation."""
     normal, foot = scene.capture.ground.unit_normal, np.asarray(scene.capture.ground.point)
-    levers = scene.body.corners @ as_matrix(state[3:7]).T
+    levers = scene.body.corners @ as_matrix(state[QUATERNION]).T
     heights = (state[:3] + levers - foot) @ normal - scene.body.radius
     low = int(np.argmin(heights))
     return float(heights[low]), np.concatenate([normal, np.cross(levers[low], normal)])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
 from .multiple_shooting import Fit
-from .observed_poses import as_matrix, project
+from .observed_poses import CONTACT, QUATERNION, SPIN, VELOCITY, as_matrix, project
 from .rigid_candidates import BELIEFS, WorldSettings
 from .rigid_prediction import world_points
 from .shooting_problem import Model, Problem, Segment, SegmentedTrial
@@ -104,10 +104,10 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     frames = len(trial.observations.times)
     clock, record, nearest = _fine(used, index)
     normal = scene.capture.ground.unit_normal
-    gains = np.maximum(np.diff(record[:, 13:17], axis=0, append=record[-1:, 13:17]), 0.0)
+    gains = np.maximum(np.diff(record[:, CONTACT], axis=0, append=record[-1:, CONTACT]), 0.0)
     gains[np.diff(clock, append=clock[-1]) <= 0] = 0.0
-    velocity = _by_frame(record[:, 7:10], nearest, frames)
-    spin = _by_frame(record[:, 10:13], nearest, frames)
+    velocity = _by_frame(record[:, VELOCITY], nearest, frames)
+    spin = _by_frame(record[:, SPIN], nearest, frames)
     pushed = _summed(gains[:, 0], nearest, frames)
     touched = _summed(gains[:, 2], nearest, frames)
     slid = _summed(gains[:, 3], nearest, frames)
@@ -145,12 +145,12 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
     if setting.pull > 0:
         gap = _gap(used.problem, record)
         # A body at rest is held, too, but its jitter is no separation: where it leaves faster is where that matters.
-        away = np.maximum(record[:, 7:10] @ normal, 0.0)
+        away = np.maximum(record[:, VELOCITY] @ normal, 0.0)
         held = (gap < setting.reach) * away / (away + REST_SPEED) * (1 - np.maximum(gap, 0.0) / setting.reach)
         lack -= (_by_frame(held[:, None], nearest, frames) * setting.pull) * normal
     if setting.fraction > 0:
-        arm = np.einsum("fij,j->fi", as_matrix(record[:, 3:7]), setting.center)
-        w = record[:, 10:13]
+        arm = np.einsum("fij,j->fi", as_matrix(record[:, QUATERNION]), setting.center)
+        w = record[:, SPIN]
         lack += _by_frame(np.cross(w, np.cross(w, arm)), nearest, frames)
     if setting.inertia != 1.0:
         turning = _turning_difference(used.problem, setting, clock, record, gains[:, 2] > 0)
@@ -164,7 +164,7 @@ def _lack(nominal: Fit, fit: Fit | None, index: int) -> tuple[Array, list[str], 
 
 def _force_difference(base: WorldSettings, setting: WorldSettings, record: Array) -> Array:
     """Return the force per mass (M, 3) of ``setting`` minus ``base`` at the states of ``record``."""
-    x, v, w = record[:, :3], record[:, 7:10], record[:, 10:13]
+    x, v, w = record[:, :3], record[:, VELOCITY], record[:, SPIN]
     u = v - setting.wind
     force = -setting.drag * np.linalg.norm(u, axis=1, keepdims=True) * u + setting.lift * np.cross(w, u)
     force = force + (setting.gravity - base.gravity)
@@ -183,9 +183,9 @@ def _turning_difference(
     body that the ground turns with the inertia of ``setting``, minus that with the believed one. Nothing else turns it
     otherwise, so this is zero where it is not ``touching`` (M,).
     """
-    turns = as_matrix(record[:, 3:7])
+    turns = as_matrix(record[:, QUATERNION])
     tensor = turns @ problem.scene.body.inertia @ np.swapaxes(turns, 1, 2)
-    momentum = np.einsum("mij,mj->mi", tensor, record[:, 10:13])
+    momentum = np.einsum("mij,mj->mi", tensor, record[:, SPIN])
     gained = np.diff(momentum, axis=0, append=momentum[-1:])
     gained[~touching | (np.diff(clock, append=clock[-1]) <= 0)] = 0.0
     # The believed body gets the same angular momentum, which turns it as many times faster as its inertia is smaller.
@@ -196,7 +196,7 @@ def _turning_difference(
 def _lowest(problem: Problem, record: Array) -> Array:
     """Return the way (M, 3) in m from the reference point to the point of the body nearest to the ground."""
     body, normal = problem.scene.body, problem.scene.capture.ground.unit_normal
-    corners = np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), body.corners)
+    corners = np.einsum("mij,kj->mki", as_matrix(record[:, QUATERNION]), body.corners)
     nearest = np.argmin(corners @ normal, axis=1)
     return np.asarray(corners[np.arange(len(corners)), nearest] - body.radius * normal)
 
@@ -246,7 +246,7 @@ def _curvature(
     """
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
-    _, slope, info = trial.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    _, slope, info = trial.observations.information(pose[:, :3], pose[:, QUATERNION], frames)
     t = trial.observations.times[frames]
     found = np.zeros((len(frames), 3))
     for k in range(len(frames)):

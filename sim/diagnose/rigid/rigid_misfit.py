@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
+from .observed_poses import QUATERNION
 from .rigid_candidates import WorldSettings
 from .shooting_problem import Problem, Segment, SegmentedTrial
 
@@ -64,7 +65,7 @@ def _remainder(
     """Return the chi² explained by a smooth change of the poses, and its degrees of freedom."""
     frames = segment.frames[free]
     pose = problem.seen_poses(segment.record[None, free], [setting])[0]
-    _, slope, info = trial.observations.information(pose[:, :3], pose[:, 3:7], frames)
+    _, slope, info = trial.observations.information(pose[:, :3], pose[:, QUATERNION], frames)
     t = trial.observations.times[frames]
     span = max(t[-1] - t[0], 1e-9)
     degree = int(np.clip(2 + span / BEND_EVERY, 2, 9))

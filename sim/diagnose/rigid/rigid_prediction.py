@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import Fit, solve
-from .observed_poses import ObservedBody, another_side_up, as_matrix, fit_rotation, perturbed
+from .observed_poses import QUATERNION, SPIN, ObservedBody, another_side_up, as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
 from .shooting_problem import Model, Problem, SegmentedTrial
@@ -45,7 +45,7 @@ def extrapolate(fit: Fit, z: Array, state: Array, times: Array) -> Array:
 def world_points(trial: SegmentedTrial, record: Array) -> Array:
     """Return world points (M, K, 3) of ``record``."""
     return np.asarray(
-        record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, 3:7]), trial.observations.places)
+        record[:, None, :3] + np.einsum("mij,kj->mki", as_matrix(record[:, QUATERNION]), trial.observations.places)
     )
 
 
@@ -182,7 +182,7 @@ def hidden_spins(fit: Fit) -> dict[str, Array]:
     for i, (trial, states) in enumerate(zip(fit.problem.trials, fit.states, strict=True)):
         if trial.observations.hides_spin:
             first = next((s.record[0] for s in fit.evaluation.segments if s.trial == i), states[0])
-            found[trial.observations.trial.name] = np.array(first[10:13])
+            found[trial.observations.trial.name] = np.array(first[SPIN])
     return found
 
 
@@ -347,7 +347,7 @@ def _lies_elsewhere(fit: Fit, index: int, begin: int, record: Array) -> bool:
         return False
     last = max((s for s in fit.evaluation.segments if s.trial == index), key=lambda s: int(s.frames[-1]))
     predicted = record[int(last.frames[-1]) - begin, 3:7]
-    return another_side_up(last.record[-1, 3:7], predicted, np.asarray(scene.capture.ground.unit_normal))
+    return another_side_up(last.record[-1, QUATERNION], predicted, np.asarray(scene.capture.ground.unit_normal))
 
 
 def _own_noise(seen: ObservedBody) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
+from .observed_poses import SPIN, VELOCITY
 from .state_tracking import fit_states
 
 Array = NDArray[np.float64]
@@ -37,13 +38,13 @@ def share_spins(fit: Fit) -> Fit:
     if not all(t.observations.hides_spin for t in trials):
         return fit
     parts = fit.problem.evaluate(fit.model, fit.z, fit.states, fixed=True).linear
-    frames = [_along(states[0, 7:10]) for states in fit.states]
+    frames = [_along(states[0, VELOCITY]) for states in fit.states]
     known = {}
     for i, (trial, part, axes) in enumerate(zip(trials, parts, frames, strict=True)):
         if trial.observations.trial.role == "fit":
             whole = np.linalg.inv(np.linalg.inv(part.hessian)[9:12, 9:12])
             own = axes.T @ (whole - np.diag(trial.prior[9:12] ** -2.0)) @ axes
-            known[i] = own, axes.T @ whole @ (fit.states[i][0, 10:13] - trial.guess[10:13])
+            known[i] = own, axes.T @ whole @ (fit.states[i][0, SPIN] - trial.guess[SPIN])
     shared = []
     for i, (trial, axes) in enumerate(zip(trials, frames, strict=True)):
         others = [both for k, both in known.items() if k != i]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .observed_poses import (
+    QUATERNION,
     ObservedBody,
     PointMoments,
     as_rotvec,
@@ -379,7 +380,7 @@ class Problem:
             if s.camera is not None:
                 turn, shift = s.camera
                 pose[v, :, :3] = pose[v, :, :3] @ turn.T + shift
-                pose[v, :, 3:7] = multiply(_quaternion(turn), pose[v, :, 3:7])
+                pose[v, :, QUATERNION] = multiply(_quaternion(turn), pose[v, :, QUATERNION])
         return pose
 
 
@@ -395,5 +396,5 @@ def _pose_slopes(pose: Array, steps: Array) -> Array:
     up, down = pose[:, 1::2], pose[:, 2::2]
     slopes = np.empty((len(pose), 6, len(steps)))
     slopes[:, :3] = (up[..., :3] - down[..., :3]).swapaxes(1, 2)
-    slopes[:, 3:] = as_rotvec(multiply(up[..., 3:7], conjugate(down[..., 3:7]))).swapaxes(1, 2)
+    slopes[:, 3:] = as_rotvec(multiply(up[..., QUATERNION], conjugate(down[..., QUATERNION]))).swapaxes(1, 2)
     return slopes / (2 * steps)

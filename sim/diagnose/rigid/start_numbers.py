@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
+from .observed_poses import QUATERNION
 
 Array = NDArray[np.float64]
 
@@ -56,7 +57,7 @@ def missing_forces(fit: Fit) -> MissingForces:
             if len(rows) < LEAST_FRAMES:
                 continue
             pose = segment.record[rows]
-            _, slope, info = seen.information(pose[:, :3], pose[:, 3:7], segment.frames[rows])
+            _, slope, info = seen.information(pose[:, :3], pose[:, QUATERNION], segment.frames[rows])
             # Best translation of each frame, and the parabola through them.
             shift = slope[:, :3] / np.maximum(info[:, 0, 0], 1e-9)[:, None]
             weight = np.sqrt(info[:, 0, 0])

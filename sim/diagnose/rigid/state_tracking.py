@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import eliminate_states
-from .observed_poses import ObservedBody, as_matrix, frame_pose, perturbed
+from .observed_poses import QUATERNION, SPIN, VELOCITY, ObservedBody, as_matrix, frame_pose, perturbed
 from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidBody, RigidWorlds
@@ -157,11 +157,11 @@ def first_state(scene: BodyScene, observations: ObservedBody, first: int = 0) ->
     if len(poses) >= 2:
         fall = x - 0.5 * np.asarray(scene.capture.gravity) * t[:, None] ** 2
         line = np.polyfit(t, fall, 1)
-        state[:3], state[7:10] = line[1], line[0]
+        state[:3], state[VELOCITY] = line[1], line[0]
     else:
         state[:3] = x[0]
     if observations.hides_spin:
-        prior[9:12] = max(STILL_SPIN, SPIN_PARAMETER * float(np.linalg.norm(state[7:10])) / scene.body.bound)
+        prior[9:12] = max(STILL_SPIN, SPIN_PARAMETER * float(np.linalg.norm(state[VELOCITY])) / scene.body.bound)
     turns = [Rotation.from_matrix(p[2]) for p in poses]
     if alone and len(poses) >= 2:
         spins = [(b * a.inv()).as_rotvec() / (t[i + 1] - t[i]) for i, (a, b) in enumerate(pairwise(turns))]
@@ -169,10 +169,10 @@ def first_state(scene: BodyScene, observations: ObservedBody, first: int = 0) ->
         # Rotated back to the start, all frames give the initial orientation.
         back = [Rotation.from_rotvec(-spin * (ti)) * r for ti, r in zip(t, turns, strict=True)]
         start = Rotation.concatenate(back).mean()
-        state[10:13] = spin
+        state[SPIN] = spin
     else:
         start = turns[0]
-    state[3:7] = np.roll(start.as_quat(), 1)
+    state[QUATERNION] = np.roll(start.as_quat(), 1)
     return state, prior
 
 
@@ -323,9 +323,9 @@ def _set_down(scene: BodyScene, simulator: RigidWorlds, trials: list[SegmentedTr
     options, fees = [], []
     for trial in near:
         down, prior = trial.states.copy(), trial.prior.copy()
-        corners = down[0, :3] + scene.body.corners @ as_matrix(down[0, 3:7]).T
+        corners = down[0, :3] + scene.body.corners @ as_matrix(down[0, QUATERNION]).T
         down[0, :3] -= ((corners - foot) @ normal - scene.body.radius).min() * normal
-        down[0, 7:10] -= (down[0, 7:10] @ normal) * normal
+        down[0, VELOCITY] -= (down[0, VELOCITY] @ normal) * normal
         window, guess = PIXEL_WINDOW, trial.guess
         if trial.observations.camera is None:
             window, guess = CONTACT_WINDOW, down[0].copy()
@@ -417,7 +417,9 @@ def weight_contacts(problem: Problem, model: Model, z: Array) -> None:
         record = np.concatenate([segment.record, segment.arrival[None]]) if b < trial.end else segment.record
         times = trial.observations.times[a : a + len(record)]
         trial.covers.append(segment_covariance(uncertainty, scene.body, record, times, weight))
-        _, _, info = trial.observations.information(segment.record[:, :3], segment.record[:, 3:7], segment.frames)
+        _, _, info = trial.observations.information(
+            segment.record[:, :3], segment.record[:, QUATERNION], segment.frames
+        )
         count = len(segment.frames)
         trial.weights.append(frame_weights(uncertainty, scene.body, segment.record, times[:count], weight, info))
 
