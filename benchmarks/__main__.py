@@ -27,7 +27,7 @@ def benchmarks() -> dict[str, str]:
     """Return the first line of each benchmark's docstring by name. Imports none of them: some need bpy."""
     found = {}
     for path in sorted(HERE.glob("*.py")):
-        if path.stem not in ("__init__", "__main__", "common", "kill_chain"):
+        if path.stem not in ("__init__", "__main__", "common", "kill_chain", "newton_run"):
             text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
             found[path.stem] = text.splitlines()[0]
     return found

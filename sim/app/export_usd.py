@@ -35,6 +35,7 @@ from ..scene.scene_object import SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh
 from .export_patch import prim_name
 from .scene_to_world import surface
+from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
 
 Array = NDArray[np.float64]
 ENDINGS = (".usda", ".usdc")
@@ -91,7 +92,7 @@ def export_usd(
     if file.exists():
         raise InputError(f"{file}: is there already; choose another name")
     try:
-        from pxr import Tf, Usd, UsdGeom
+        from pxr import Tf, Usd, UsdGeom, UsdPhysics
     except ImportError as error:
         if ran_out(error):
             raise
@@ -101,6 +102,7 @@ def export_usd(
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
     if bake is not None:
         stage.SetTimeCodesPerSecond(bake.manifest.fps)
@@ -150,6 +152,9 @@ class _Writer:
         self.notes: list[str] = []
         self.pictures: dict[Path, bytes] = {}
         self.names: set[str] = set()
+        self.particles, why = prepared_particles(scene)
+        if why:
+            self.notes.append(f"no particles are written, since this scene cannot be baked as it is: {why}")
         ground = scene.model.ground
         self.ground = (
             SurfaceContact() if ground is None else
@@ -168,12 +173,14 @@ class _Writer:
         down = np.array(model.gravity) / size if size > 0 else np.array([0.0, 0.0, -1.0])
         physics.CreateGravityDirectionAttr(Gf.Vec3f(*map(float, down)))
         physics.CreateGravityMagnitudeAttr(size)
+        if self.particles is not None:
+            write_scene(physics.GetPrim(), self.particles)
         if model.ground is not None:
             self._ground(model.ground.point, model.ground.normal)
         self._camera()
         baked = {item.name: item for item in self.bake.manifest.objects} if self.bake else {}
-        for item in model.objects:
-            self._object(item, baked.get(item.name))
+        for index, item in enumerate(model.objects):
+            self._object(index, item, baked.get(item.name))
         kinds = {"named contacts": model.contacts, "effects": model.effects, "keyed gravity": model.gravity_track}
         missing = [kind for kind, there in kinds.items() if there]
         if missing:
@@ -231,7 +238,7 @@ class _Writer:
         # USD looks along -z with y up, the scene's camera along z with y down.
         self._place(found, np.asarray(camera.world_from_camera) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
-    def _object(self, item: SceneObject, baked: BakedObject | None) -> None:
+    def _object(self, index: int, item: SceneObject, baked: BakedObject | None) -> None:
         from pxr import Gf, UsdGeom, UsdPhysics
 
         mesh = read_textured_mesh(self.scene.file(item.mesh))
@@ -275,20 +282,28 @@ class _Writer:
             api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, mass.centre - centre)))
             api.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, mass.inertia)))
             api.CreatePrincipalAxesAttr(Gf.Quatf(_quaternion(mass.axes)))
-        self._bind(shape, self._material(name, surface(item, self.ground), item, mesh))
+        material = self._material(name, surface(item, self.ground), item, mesh)
+        self._bind(shape, material)
         if not rigid:
-            self._matter(prim, item)
+            self._matter(index, name, item, material)
         if self.bake is not None and baked is not None:
             self._motion(name, baked, matrix, world, centre, shape, operations if rigid else None)
 
-    def _matter(self, prim: Any, item: SceneObject) -> None:
-        """Keep what UsdPhysics has no schema for with the body."""
-        material = item.material
+    def _matter(self, index: int, name: str, item: SceneObject, bound: Any) -> None:
+        """Write what UsdPhysics has no schema for: as custom data, and as particles of Newton's schema."""
+        prim, material = self.stage.GetPrimAtPath(f"/World/{name}"), item.material
         prim.SetCustomDataByKey("physgen:law", material.law)
         for field in ("density", "youngs_modulus", "poisson_ratio"):
             prim.SetCustomDataByKey(f"physgen:{field}", float(getattr(material, field)))
-        if item.role == "dynamic":
-            self.notes.append(f"USD Physics has no {material.law} bodies: the matter of {item.name} is custom data")
+        if item.role != "dynamic" or self.particles is None:
+            return
+        body = self.particles.body_of_object[index]
+        assert body is not None
+        path = f"/World/{name}/matter"
+        write_particles(self.stage, path, self.particles.setup.bodies[body], material, bound.GetPrim())
+        self._bind(self.stage.GetPrimAtPath(path), bound)
+        if not is_whole(material):
+            self.notes.append(f"the law of {item.name} ({material.law}) is written in part: elasticity or viscosity")
 
     def _mesh(self, path: str, mesh: TexturedMesh, points: Array, faces: NDArray[np.int64]) -> Any:
         from pxr import Sdf, UsdGeom, Vt

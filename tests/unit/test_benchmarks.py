@@ -20,6 +20,7 @@ FAST = (
     "main_thread",
     "materials",
     "mpm",
+    "peers",
     "playback",
     "render",
     "rest",

@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from physgen.batch.cli import main
 from physgen.sim.app.export_usd import mass_of
+from physgen.sim.app.usd_particles import mpm_material, prepared_particles
 from physgen.sim.cache.bake_folder import Bake, BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.errors import InputError
@@ -157,6 +158,62 @@ def test_it_opens_again_with_all_that_it_was_written_from(scene, bake, tmp_path,
     grains = np.array(cloud.GetPointsAttr().Get(3))
     np.testing.assert_allclose(grains, moved(scene, 1, 0)[:40] * 0.5 + [0, 0, -0.02], atol=1e-7)
     assert cloud.GetWidthsInterpolation() == "constant" and 0.01 < cloud.GetWidthsAttr().Get()[0] < 0.1
+
+
+def schemas(prim):
+    """Names of all schemas that ``prim`` applies, those that are not installed here included."""
+    return set(prim.GetMetadata("apiSchemas").GetAddedOrExplicitItems())
+
+
+def test_particles_of_what_deforms_are_those_of_a_bake_in_the_schema_of_newton(scene, tmp_path):
+    """By name: newton-physics itself is not installed here. ``benchmarks.peers --usd`` has it step such a file."""
+    moving = dataclasses.replace(scene.model.objects[1], velocity=(0.0, 1.0, 0.5), spin=(0.0, 0.0, 2.0))
+    scene = save_scene(scene.root, dataclasses.replace(scene.model, objects=(scene.model.objects[0], moving)))
+    physgen.export_usd(scene, tmp_path / "s.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "s.usda"))
+    assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1.0
+    prepared, why = prepared_particles(scene)
+    body = prepared.setup.bodies[1]
+    owner = stage.GetPrimAtPath("/World/physicsScene")
+    assert why == "" and "NewtonMPMSceneAPI" in schemas(owner)
+    cell = prepared.solver.cell_size(prepared.similarity)
+    assert owner.GetAttribute("newton:mpm:voxelSize").Get() == pytest.approx(cell)
+    points = UsdGeom.Points(stage.GetPrimAtPath("/World/jelly/matter"))
+    prim = points.GetPrim()
+    assert schemas(prim) >= {"NewtonPointsDeformableSimAPI", "PhysicsDeformableBodyAPI"}
+    assert prim.GetRelationship("physics:simulationOwner").GetTargets() == [owner.GetPath()]
+    matrix = np.array(points.ComputeLocalToWorldTransform(1))
+    places = np.array(points.GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]
+    np.testing.assert_allclose(places, body.positions, atol=1e-7)
+    masses = np.array(prim.GetAttribute("physics:masses").Get(), dtype=float)
+    np.testing.assert_allclose(masses, moving.material.density * body.volumes, rtol=1e-6)
+    speeds = np.array(points.GetVelocitiesAttr().Get(), dtype=float)
+    np.testing.assert_allclose(masses @ speeds / masses.sum(), moving.velocity, atol=1e-6)
+    arms = places - masses @ places / masses.sum()
+    np.testing.assert_allclose(speeds - moving.velocity, np.cross(moving.spin, arms), atol=1e-6)
+    bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+    assert "NewtonMPMMaterialAPI" in schemas(bound.GetPrim())
+    said = bound.GetPrim().GetAttribute("newton:mpm:youngsModulus").Get()
+    assert said == pytest.approx(moving.material.youngs_modulus)
+    # A rigid body has none.
+    assert not stage.GetPrimAtPath("/World/my_crate/matter")
+
+
+def test_each_law_says_where_it_yields():
+    sand, clay, water = (mpm_material(load_preset(name)) for name in ("sand", "clay", "water"))
+    assert sand["internalFriction"] == pytest.approx(math.tan(0.576)) and sand["tensileYieldRatio"] == 0
+    assert clay["yieldStress"] == pytest.approx(load_preset("clay").yield_stress / math.sqrt(3))
+    assert clay["internalFriction"] == 0 and "youngsModulus" not in water and water["internalFriction"] == 0
+    rubber = mpm_material(load_preset("medium"))
+    assert rubber["tensileYieldRatio"] == 1 and "yieldStress" not in rubber
+
+
+def test_a_scene_that_cannot_be_baked_is_exported_without_particles(scene, tmp_path):
+    low = dataclasses.replace(scene.model, ground=Ground(point=(0.0, 0.0, 5.0)))
+    notes = physgen.export_usd(save_scene(scene.root, low), tmp_path / "s.usda")
+    assert any("no particles are written" in note and "ground" in note for note in notes)
+    stage = Usd.Stage.Open(str(tmp_path / "s.usda"))
+    assert stage.GetPrimAtPath("/World/jelly/mesh") and not stage.GetPrimAtPath("/World/jelly/matter")
 
 
 def test_its_camera_sees_points_at_the_same_pixels(scene, tmp_path):
