@@ -196,6 +196,8 @@ def segment(
         if backdrop is not None:
             lacking = missing_parts(pixels, _at(found, pixels.shape, left, top), box, backdrop)
             lacking = lacking[top:bottom, left:right] & ~taken & ~drop & ~gaps
+            # A stroke that drops some of a part means all of it.
+            lacking &= ~touching(lacking | drop, drop)
             if lacking.any():
                 beside = cv2.dilate(lacking.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
                 found = np.where(beside, settle_outline(crop, found | lacking), found)
