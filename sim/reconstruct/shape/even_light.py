@@ -50,9 +50,10 @@ MOST = 1.5
 
 
 def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -> Picture:
-    """Return the logarithm (h, w, 3) of the light in ``texture`` that follows the normals of ``body``, 0 on average.
+    """Return the logarithm (h, w, 3) of the light in ``texture`` that follows the normals of ``body``.
 
-    mask: (h, w) the object in the texture. Zero where the photo does not tell.
+    Its mean is 0 with the squared cosine of the angle to the camera as weight. mask: (h, w) the object in the texture.
+    Zero where the photo does not tell.
     """
     height, width = mask.shape
     none = np.zeros((height, width, 3), dtype=np.float32)
@@ -80,7 +81,9 @@ def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -
         return none
     basis = _basis(normal)
     found, share = _fitted(basis[common], logs[common])
-    light = np.clip((basis @ found) - (basis[common] @ found).mean(axis=0), -MOST, MOST) * share
+    # What faces the camera sets the level: a back is held against that, not against a dark flank or a bright top.
+    usual = np.average(basis[common] @ found, axis=0, weights=cosine[common] ** 2)
+    light = np.clip(basis @ found - usual, -MOST, MOST) * share
     away = cKDTree(normal[common]).query(normal, distance_upper_bound=UNLIKE[1])[0]
     light *= smoothstep(np.minimum(away, UNLIKE[1]), UNLIKE[1], UNLIKE[0])[:, None]
     grid = np.zeros((size[1], size[0], 3), dtype=np.float32)
