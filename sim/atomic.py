@@ -34,6 +34,8 @@ _PATIENT = os.name == "nt"
 
 _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.(?P<role>partial|old)-(?P<mark>{MARK})(?P<suffix>(?:\.[^/]*)?)", re.DOTALL)
 _LOCK_OF_TEMPORARY = re.compile(rf"\.(?P<of>\..+\.(?:partial|old)-{MARK})\.lock", re.DOTALL)
+_LIBRARYS = re.compile(r"\.[A-Za-z0-9]{6}")
+"""Suffix in place of ours of the file in which usd-core first writes what it is to write under a temporary name."""
 _SCRATCH = re.compile(rf"physgen-(?:[a-z]+-)?(?P<mark>{MARK})-.+")
 
 LONGEST_NAME = 255
@@ -189,6 +191,9 @@ def remove_unfinished() -> None:
     """Remove all that this process has not finished writing, for an exit that skips ``finally`` blocks."""
     for path in list(_unfinished):
         _remove(path)
+        for left in _entries(path.parent):
+            if left.stem == path.stem and _LIBRARYS.fullmatch(left.suffix):
+                _remove(left)
 
 
 def _replace(partial: Path, path: Path) -> None:
@@ -311,8 +316,16 @@ def _dead_mark(name: str) -> Mark | None:
 
 def _dead_beside(path: Path) -> Iterator[Path]:
     for left in _entries(path.parent):
-        if _dead_mark(left.name) and _is_ours(left) and path.name in _names(left.name):
+        if _dead_mark(left.name) and _is_ours(left) and (path.name in _names(left.name) or _is_librarys(left, path)):
             yield left
+
+
+def _is_librarys(left: Path, path: Path) -> bool:
+    """Return whether ``left`` is what a library wrote in place of the temporary file of ``path``."""
+    found = _TEMPORARY.fullmatch(left.name)
+    if found is None or found["role"] != "partial" or found["name"] != path.stem:
+        return False
+    return _LIBRARYS.fullmatch(found["suffix"]) is not None and not left.is_dir()
 
 
 def _names(name: str) -> Iterator[str]:

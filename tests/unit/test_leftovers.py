@@ -152,6 +152,31 @@ def test_the_next_command_clears_away_what_a_dead_one_left_and_nothing_else(
     assert said.count("removed, left by a run that was killed") == len(gone) + 1
 
 
+def test_what_a_library_writes_in_place_of_a_temporary_file_is_cleared_away(tmp_path, dead, living, monkeypatch):
+    """usd-core writes x.usda as x.AbC123 first."""
+    gone = tmp_path / f".toy.partial-{dead}.lRQV0C"
+    names = [
+        f".toy.partial-{living}.lRQV0C",
+        f".toy.partial-{dead}.short",
+        f".cup.partial-{dead}.lRQV0C",
+        ".toy.lRQV0C",
+    ]
+    kept = [tmp_path / name for name in (*names, f".toy.old-{dead}.lRQV0C")]
+    for path in (gone, *kept):
+        path.write_text("half")
+    assert len(atomic.recover(tmp_path / "toy.usda")) == 1
+    assert not gone.exists() and all(path.exists() for path in kept)
+    # An exit that skips finally blocks removes its own.
+    monkeypatch.setattr(atomic, "_unfinished", set())
+    with atomic.replacing(tmp_path / "toy.usda") as partial:
+        mine = partial.with_suffix(".a1B2c3")
+        mine.write_text("half")
+        partial.write_text("whole")
+        atomic.remove_unfinished()
+        assert not mine.exists() and all(path.exists() for path in kept)
+        partial.write_text("whole")
+
+
 def test_a_folder_that_was_moved_aside_is_put_back(tmp_path, dead, ball_scene):
     root = ball_scene().root
     content = (root / "scene.json").read_bytes()
