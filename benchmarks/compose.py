@@ -155,7 +155,7 @@ def _parser() -> QuickParser:
     )
     parser.add_argument("--stand", action="store_true", help="drop the compositions for 5 s in another engine, MuJoCo")
     thickness = "thickness of the seats of what is dropped, over its size; 0: none (default: %(default)s)"
-    parser.add_argument("--seat", type=float, default=0.005, help=thickness)
+    parser.add_argument("--seat", type=float, default=0.006, help=thickness)
     parser.add_argument("--truth", action="store_true", help="drop the assets' true shapes, too")
     every = (*NAMES, *TABLES)
     some = f"assets {', '.join(NAMES)}; with --stand also scenes {', '.join(TABLES)} (default: all)"

@@ -67,7 +67,7 @@ def test_compositions_are_dropped_quickly():
     found = json.loads(done.stdout.strip().splitlines()[-1])
     every = ["composed, free", "composed, held", "composed, free", "truth, held", "truth, free"]
     assert [row["what"] for row in found["rows"]] == every and found["rows"][0]["asset"] == "loaf"
-    assert found["seat"] == 0.005 and [row["asset"] for row in found["pictures"]] == ["ring"]
+    assert found["seat"] == 0.006 and [row["asset"] for row in found["pictures"]] == ["ring"]
 
 
 def test_defaults_of_quick_yield_to_given_options():
