@@ -31,7 +31,7 @@ def prepared_particles(scene: Scene) -> tuple[PreparedWorld | None, str]:
         return None, ""
     try:
         meshes = [load_object_mesh(scene, item) for item in scene.model.objects]
-        return prepare_world(scene, meshes, BakeOptions()), ""
+        return prepare_world(scene, meshes, BakeOptions(), check_surfaces=False), ""
     except InputError as error:
         return None, str(error)
 
@@ -86,10 +86,7 @@ def write_particles(stage: Any, path: str, body: BodyParticles, material: Materi
     for schema in ("NewtonPointsDeformableSimAPI", "PhysicsDeformableBodyAPI"):
         prim.AddAppliedSchema(schema)
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    places = np.asarray(body.positions)
-    masses = material.density * np.asarray(body.volumes)
-    if body.density_scale is not None:
-        masses = masses * body.density_scale
+    places, masses = np.asarray(body.positions), body.masses
     centre = np.average(places, axis=0, weights=masses)
     velocities = np.asarray(body.velocity) + np.cross(np.asarray(body.spin), places - centre)
     points.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(places.astype(np.float32)))

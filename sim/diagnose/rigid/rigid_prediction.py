@@ -346,7 +346,7 @@ def _lies_elsewhere(fit: Fit, index: int, begin: int, record: Array) -> bool:
     if scene.body.round:
         return False
     last = max((s for s in fit.evaluation.segments if s.trial == index), key=lambda s: int(s.frames[-1]))
-    predicted = record[int(last.frames[-1]) - begin, 3:7]
+    predicted = record[int(last.frames[-1]) - begin, QUATERNION]
     return another_side_up(last.record[-1, QUATERNION], predicted, np.asarray(scene.capture.ground.unit_normal))
 
 

@@ -54,9 +54,9 @@ WHOLE = 0.995
 BESIDE = 0.03
 """Area over the largest thing's below which one is left out: a crumb beside a cake."""
 ALIKE, OVERLAP, COVERED, FEWEST = 4.0, 0.25, 0.7, 3
-"""Sweets that touch are one contour, and so is a toy. They are told apart by the boxes of what stands out by itself
-where these are of one size, up to this factor in area, overlap by less than this share of the smaller, cover more than
-this share of the contour, and are that many at least."""
+"""Candies that touch share one contour, as do the parts of a toy. The contour is split into the boxes of what stands
+out by itself where their areas differ by at most this factor, they overlap by less than this share of the smaller,
+cover more than this share of the contour, and number at least this many."""
 UNLIKE = 5.0
 """Distance in CIELAB from the backdrop of a part that an outline lacks."""
 SEAM = 3.0
