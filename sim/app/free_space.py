@@ -108,13 +108,12 @@ class PlateColours:
             return
         import cv2
 
-        from ..composite.srgb import read_rgb
+        from ..composite.srgb import cielab, read_rgb
 
         image = read_rgb(scene.file(scene.model.background))
         scale = min(1.0, self.SIDE / max(image.shape[:2]))
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        lab = cv2.cvtColor(small.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-        self._image = np.asarray(lab, dtype=np.float32)
+        self._image = cielab(np.asarray(small, dtype=np.uint8))
 
     def difference(self, camera: Camera, here: Array, there: Array) -> float:
         """Return how unlike the ground at the points ``here`` and ``there`` (K, 3) looks, 0 to 1: ΔE 40 is 1."""

@@ -47,6 +47,17 @@ def linear_to_bytes(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(linear_to_srgb(linear) * 255.0).astype(np.uint8)
 
 
+def cielab(pixels: NDArray[np.uint8], *, blur: float = 0.0) -> NDArray[np.float32]:
+    """Return 8-bit sRGB (h, w, 3) in CIELAB under D65, L* from 0 to 100.
+
+    blur: standard deviation in pixels of a Gaussian filter of the encoded values before; 0 for none.
+    """
+    values = pixels.astype(np.float32) / 255.0
+    if blur > 0.0:
+        values = np.asarray(cv2.GaussianBlur(values, (0, 0), blur), dtype=np.float32)
+    return np.asarray(cv2.cvtColor(values, cv2.COLOR_RGB2LAB), dtype=np.float32)
+
+
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Return an image file as (H, W, 3) 8-bit sRGB. Raises InputError when it is missing or unreadable."""
     return _read(path, "RGB")

@@ -21,8 +21,10 @@ Array = NDArray[np.float64]
 
 QUATERNION, VELOCITY, SPIN, CONTACT = slice(3, 7), slice(7, 10), slice(10, 13), slice(13, 17)
 """Columns of a state (..., 13) and of a record (..., 17) behind its position in m: quaternion (w first), velocity in
-m/s, spin in rad/s; of a record also, added up over all contacts since its start, the normal impulse per mass in m/s,
-that of friction, and the times in contact and sliding in s."""
+m/s, spin in rad/s; of a record also, added up over all contacts since its start, the four below."""
+PUSHED, RUBBED, TOUCHED, SLID = 13, 14, 15, 16
+"""Columns of a record's contacts: the normal impulse per mass in m/s, that of friction, the time in contact in s, and
+that of sliding."""
 
 LEVEL_SHARE, LEVEL_ANGLE, LEAST_TURN = 0.1, 0.1, 0.3
 """A body slides on a face where its height changes by at most this share of its size, and its upright by this angle in

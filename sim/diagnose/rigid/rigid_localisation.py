@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
 from .multiple_shooting import Fit
-from .observed_poses import CONTACT, QUATERNION, SPIN, VELOCITY, as_matrix, project
+from .observed_poses import CONTACT, QUATERNION, SPIN, TOUCHED, VELOCITY, as_matrix, project
 from .rigid_candidates import BELIEFS, WorldSettings
 from .rigid_prediction import world_points
 from .shooting_problem import Model, Problem, Segment, SegmentedTrial
@@ -221,7 +221,7 @@ def measured_force(fit: Fit, index: int) -> Array:
     for segment in fit.evaluation.segments:
         if segment.trial != index:
             continue
-        free = np.flatnonzero(segment.record[:, 15] <= 0)
+        free = np.flatnonzero(segment.record[:, TOUCHED] <= 0)
         if len(free) >= 6:
             lack[segment.frames[free]] = _curvature(problem, trial, segment, free, setting)
         if segment.defect is not None:
@@ -229,7 +229,7 @@ def measured_force(fit: Fit, index: int) -> Array:
             jump = segment.defect[6:9]
             size = float(np.linalg.norm(jump / deviation))
             jump = -jump * max(0.0, 1 - 2.5 / max(size, 1e-9))
-            touching = segment.frames[np.diff(segment.record[:, 15], prepend=0.0) > 0]
+            touching = segment.frames[np.diff(segment.record[:, TOUCHED], prepend=0.0) > 0]
             if len(touching):
                 span = max(times[touching[-1]] - times[max(touching[0] - 1, 0)], 1e-3)
                 lack[touching] += jump / span

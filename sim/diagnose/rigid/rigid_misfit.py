@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
-from .observed_poses import QUATERNION
+from .observed_poses import QUATERNION, TOUCHED
 from .rigid_candidates import WorldSettings
 from .shooting_problem import Problem, Segment, SegmentedTrial
 
@@ -44,7 +44,7 @@ def misfit(fit: Fit) -> Misfit:
     setting = fit.model.setting(problem.scene, fit.z)
     for segment in fit.evaluation.segments:
         trial, own = problem.trials[segment.trial], sums[segment.trial]
-        free = np.flatnonzero(segment.record[:, 15] <= 0)
+        free = np.flatnonzero(segment.record[:, TOUCHED] <= 0)
         if len(free) >= LEAST_FRAMES:
             own[:2] += _remainder(problem, trial, segment, free, setting)
         if segment.defect is not None:

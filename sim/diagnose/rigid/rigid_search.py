@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..work import Work
 from .multiple_shooting import Fit, solve
-from .observed_poses import ObservedBody, frame_pose, observe_body, turns_on_a_face
+from .observed_poses import TOUCHED, ObservedBody, frame_pose, observe_body, turns_on_a_face
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, tether_numbers
 from .rigid_misfit import misfit
 from .rigid_simulator import RigidWorlds, on_its_rim, rigid_body
@@ -286,7 +286,7 @@ def scanned(body: BodyFits, begin: Fit, model: Model, candidate: CandidateEffect
     # A state without a following flight is only known from its contacts and stays.
     states = [s.copy() for s in begin.states]
     for segment in flown.evaluation.segments:
-        if int((segment.record[:, 15] <= 0).sum()) >= FLIES:
+        if int((segment.record[:, TOUCHED] <= 0).sum()) >= FLIES:
             states[segment.trial][segment.index] = flown.states[segment.trial][segment.index]
     order = np.argsort(costs)
     best = [tried[int(order[0])]]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
-from .observed_poses import QUATERNION
+from .observed_poses import QUATERNION, TOUCHED
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def missing_forces(fit: Fit) -> MissingForces:
         seen = fit.problem.trials[segment.trial].observations
         if seen.camera is not None:
             continue
-        free = np.flatnonzero(segment.record[:, 15] <= 0)
+        free = np.flatnonzero(segment.record[:, TOUCHED] <= 0)
         clock = seen.times[segment.frames]
         for begin in np.arange(clock[0], clock[-1], WINDOW_S):
             rows = free[(clock[free] >= begin) & (clock[free] < begin + WINDOW_S)]

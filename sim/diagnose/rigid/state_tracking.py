@@ -17,7 +17,18 @@ from scipy.spatial.transform import Rotation
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import eliminate_states
-from .observed_poses import QUATERNION, SPIN, VELOCITY, ObservedBody, as_matrix, frame_pose, perturbed
+from .observed_poses import (
+    PUSHED,
+    QUATERNION,
+    RUBBED,
+    SPIN,
+    TOUCHED,
+    VELOCITY,
+    ObservedBody,
+    as_matrix,
+    frame_pose,
+    perturbed,
+)
 from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidBody, RigidWorlds
@@ -54,9 +65,9 @@ def contact_spread(
 
     weight: nominal gravity normal to the ground, m/s², whose impulse on a resting body is no impact.
     """
-    touched = record[:, 15]
-    blow = np.maximum(record[:, 13] - weight * touched, 0.0)
-    speed = np.hypot(uncertainty.blow * blow, uncertainty.tangential * record[:, 14])
+    touched = record[:, TOUCHED]
+    blow = np.maximum(record[:, PUSHED] - weight * touched, 0.0)
+    speed = np.hypot(uncertainty.blow * blow, uncertainty.tangential * record[:, RUBBED])
     speed = np.hypot(speed, uncertainty.floor_speed * (touched > 0))
     place = np.hypot(uncertainty.late * blow, uncertainty.floor_shift * (touched > 0))
     return speed, place
@@ -355,7 +366,7 @@ def _window(trial: SegmentedTrial, record: Array) -> int:
     """Return the end (exclusive) of the frames to which the state at the node is fitted."""
     node = trial.nodes[0]
     times = trial.observations.times[node : trial.end] - trial.observations.times[node]
-    touched = record[:, 15] > 0
+    touched = record[:, TOUCHED] > 0
     first = int(np.argmax(touched)) if touched.any() else len(times)
     flight = PIXEL_WINDOW if trial.observations.camera is not None else FLIGHT_WINDOW
     if not trial.observations.poses_alone:
@@ -384,7 +395,7 @@ def _lost(observations: ObservedBody, segment: Segment) -> int | None:
 
 def _next_node(times: Array, record: Array) -> int | None:
     """Return the frame of the segment at which the next one begins; None where it lasts to the end."""
-    touched = record[:, 15]
+    touched = record[:, TOUCHED]
     if touched[-1] <= 0:
         return None
     gain = np.diff(touched, prepend=0.0) > 0

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from skimage.segmentation import watershed
 
+from ...composite.srgb import cielab
+
 Mask = NDArray[np.bool_]
 
 SHADE = (0.28, 0.9)
@@ -95,7 +97,7 @@ def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     3) sRGB.
     """
     area = int(mask.sum())
-    lab = _lab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 1.0), dtype=np.uint8))
+    lab = cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 1.0), dtype=np.uint8))
     ring = surrounding_ring(mask, max(4, round(0.12 * np.sqrt(area))))
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
     near, inside = lab[ring], lab[inner]
@@ -131,7 +133,7 @@ def see_through(
     result = np.zeros_like(mask)
     area = int(mask.sum())
     size = float(np.sqrt(area))
-    lab = _lab(pixels)
+    lab = cielab(pixels)
     ring = surrounding_ring(mask | regions, max(4, round(0.12 * np.sqrt(area))))
     for index in range(1, count):
         region = labels == index
@@ -172,10 +174,6 @@ def _as_beside(lab: NDArray[np.float32], region: Mask, ring: Mask) -> bool:
         if len(own) > 2 and len(beside) > 5:
             apart.append(float(np.linalg.norm(np.median(own, axis=0) - np.median(beside, axis=0))))
     return len(apart) < 3 or float(np.median(apart)) < BESIDE
-
-
-def _lab(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return np.asarray(cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB), dtype=np.float32)
 
 
 def settle_outline(pixels: NDArray[np.uint8], mask: Mask, *, band: int = 3, contrast: float = 25.0) -> Mask:

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...composite.srgb import cielab
 from .mask_cleanup import largest_component
 
 Features = NDArray[np.float32]
@@ -189,9 +190,8 @@ def crop_around_box(
 ) -> BoxCrop:
     """Return the ``BoxCrop`` of a small copy ``pixels`` (h, w, 3)."""
     empty = np.zeros(pixels.shape[:2], dtype=bool)
-    smooth = cv2.GaussianBlur(pixels.astype(np.float32) / 255.0, (0, 0), 0.8)
-    lab = np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), dtype=np.float32)
-    light = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
+    lab = cielab(pixels, blur=0.8)
+    light = cielab(pixels)[..., 0]
     mean = cv2.GaussianBlur(light, (0, 0), 2.0)
     spread = np.sqrt(np.maximum(cv2.GaussianBlur(light**2, (0, 0), 2.0) - mean**2, 0.0))
     # An edge between two plain surfaces is not texture: use the calmest window around each pixel.

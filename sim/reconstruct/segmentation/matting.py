@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ...composite.srgb import bytes_to_linear, linear_to_bytes
+from ...composite.srgb import bytes_to_linear, cielab, linear_to_bytes
 from .mask_cleanup import touching
 from .mask_proposals import LIMIT, crop_around_box, graph_cut, ground_likelihood, learn, principal_contrast
 
@@ -174,7 +174,7 @@ def soft_alpha(pixels: Pixels, mask: Mask, *, width: float | None = None, others
 
 def _apart(pixels: Pixels, trimap: Trimap, reach: float) -> Alpha:
     """Return how far (h, w), 0 to 1, the local mean colours of both sides can be told apart."""
-    lab = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    lab = cielab(pixels)
     means = []
     for side in (trimap.own, trimap.other):
         weight = side.astype(np.float32)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from skimage.segmentation import felzenszwalb, slic
 
+from ...composite.srgb import cielab
 from ..reconstruct_options import Proposal
 from .mask_cleanup import largest_component
 from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
@@ -179,7 +180,7 @@ def saliency(pixels: Pixels, segments: NDArray[np.int_]) -> NDArray[np.float32]:
     from scipy.sparse.csgraph import dijkstra
     from scipy.sparse.linalg import spsolve
 
-    lab = cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    lab = cielab(pixels)
     count = int(segments.max()) + 1
     flat = segments.ravel()
     area = np.bincount(flat, minlength=count).astype(np.float64)
@@ -239,7 +240,7 @@ def candidates(pixels: Pixels) -> list[Mask]:
     """Return regions (h, w) of the copy that may be objects, unordered and overlapping."""
     height, width = pixels.shape[:2]
     smooth = np.asarray(cv2.bilateralFilter(pixels, 5, 30.0, 3.0), dtype=np.uint8)
-    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    lab = cielab(smooth)
     segments = slic(lab, n_segments=300, compactness=12.0, start_label=0, convert2lab=False, channel_axis=-1)
     stands_out = saliency(smooth, np.asarray(segments))
     rare = _unlike_border(pixels)
@@ -318,8 +319,7 @@ def examined_candidates(pixels: Pixels) -> list[Examined]:
 
 def _lab_of(pixels: Pixels) -> NDArray[np.float32]:
     """CIELAB (h, w, 3) of the copy, a little smoothed."""
-    blurred = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.float32) / 255.0
-    return np.asarray(cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    return cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 0.8), dtype=np.uint8))
 
 
 def _promise(mask: Mask, lab: NDArray[np.float32], edges: NDArray[np.float32]) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...composite.srgb import cielab
 from .mask_cleanup import touching
 from .mask_proposals import edge_strength
 
@@ -79,8 +80,7 @@ def _rim(pixels: NDArray[np.uint8], mask: Mask, barred: Mask) -> Mask:
     reach, least = REACH * extent, max(LEAST_PIXELS, LEAST_WIDTH * extent)
     if reach < 1.5 * least:
         return nothing
-    smooth = cv2.GaussianBlur(pixels.astype(np.float32) / 255.0, (0, 0), 0.8)
-    lab = np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    lab = cielab(pixels, blur=0.8)
     away = np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5), dtype=np.float32)
     band = ~mask & ~barred & (away <= reach)
     apart = _apart(lab, away, mask | barred, band, reach)

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...composite.srgb import cielab
+
 Mask = NDArray[np.bool_]
 
 REACH = 8
@@ -67,7 +69,7 @@ def in_focus(masks: Sequence[Mask], pixels: NDArray[np.uint8]) -> list[bool]:
 
     Where nothing is sharp, as in a shaken photo, everything is in focus.
     """
-    lab = np.asarray(cv2.cvtColor(pixels.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB), dtype=np.float32)
+    lab = cielab(pixels)
     widths = [outline_width(mask, lab) for mask in masks]
     least, more = OUT_OF_FOCUS
     limit = max(least, more * min((width for width in widths if width is not None), default=0.0))

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...composite.srgb import cielab
 from ..reconstruct_options import Proposal
 from .mask_cleanup import touching
 from .mask_proposals import edge_strength
@@ -71,7 +72,7 @@ COLOURED = 10.0
 
 def plain_backdrop(pixels: Pixels) -> Mask | None:
     """Return the backdrop (h, w) of ``pixels`` (H, W, 3) on a copy of at most ``SIDE``; None where it is not plain."""
-    steps = edge_strength(_lab(_copy(pixels)))
+    steps = edge_strength(cielab(_copy(pixels), blur=0.8))
     calm = (steps < CALM).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * PASS + 1, 2 * PASS + 1))
     _, labels = cv2.connectedComponents(cv2.erode(calm, disc), connectivity=4)
@@ -148,7 +149,7 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     rows = np.flatnonzero(own.any(axis=1))
     if len(rows) == 0:
         return nothing
-    lab = _lab(_copy(pixels))
+    lab = cielab(_copy(pixels), blur=0.8)
     behind = _behind(lab, backdrop)
     foot = rows[-1] - FOOT * (rows[-1] - rows[0])
     below = (np.arange(len(own)) > foot)[:, None]
@@ -282,8 +283,3 @@ def _copy(pixels: Pixels, side: int = SIDE) -> Pixels:
     scale = min(1.0, side / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _lab(pixels: Pixels) -> NDArray[np.float32]:
-    smooth = cv2.GaussianBlur(pixels.astype(np.float32) / 255.0, (0, 0), 0.8)
-    return np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), dtype=np.float32)

@@ -22,6 +22,7 @@ from skimage.morphology import reconstruction
 
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...composite.pull_push import fill_gaps
+from ...composite.srgb import cielab
 from .stripes import beside_stripes, enclosed
 
 Mask = NDArray[np.bool_]
@@ -188,7 +189,7 @@ def _filled(plain: NDArray[np.float64], marks: Mask, inside: Mask) -> NDArray[np
         patched = inpaint_once(
             np.rint(colours * 255.0).astype(np.uint8), several, ~inside | marks, FillOptions(radius=3)
         )
-        result[several] = cv2.cvtColor(patched.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[several]
+        result[several] = cielab(patched)[several]
     return result
 
 
