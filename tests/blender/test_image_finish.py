@@ -35,6 +35,7 @@ def frames(folder, opened, options, samples):
     return made
 
 
+@pytest.mark.long
 def test_everything_on_changes_nothing_at_rest_and_each_changes_what_moves(world, bake):
     glossy = with_ground(world.folder, reflectivity=0.3)
     opened = open_bake(load_bake(bake([(0, 0, 0), (0, -0.05, LIFT)])), world.folder)

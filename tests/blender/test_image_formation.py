@@ -61,6 +61,7 @@ def test_rest_is_the_photo_and_motion_is_the_truth(world, frames):
     assert abs(float((moved.astype(float) - world.moved)[inside].mean())) < 6
 
 
+@pytest.mark.long
 def test_only_rendering_what_can_be_seen_changes_nothing(world, bake):
     opened = open_bake(load_bake(bake([(0, 0, 0), SHIFT])), world.folder)
     pictures = []

@@ -7,6 +7,7 @@ bpy = pytest.importorskip("bpy")
 from physgen.benchmarks.light import WANTED_DEG, WANTED_SHARE, Case, measure
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "case",
     [

@@ -38,6 +38,7 @@ def test_an_input_does_not_depend_on_earlier_ones():
     assert first == [mutated(content, random.Random(index), as_json=True) for index in range(400)]
 
 
+@pytest.mark.long
 def test_only_own_errors_escape_from_any_loader():
     check(fuzz(40, seed=0), 40)
 

@@ -97,6 +97,7 @@ def tree(tmp_path):
     return copy.parent
 
 
+@pytest.mark.long
 def test_a_model_is_one_file_and_a_preset(tree, ball_scene, tmp_path):
     folder = ball_scene(preset="jelly", velocity=(0.0, 0.0, -1.0))
     variants = {"toy": ["ball0.preset=toy"], "stiffer": ["ball0.preset=toy", "ball0.toy_factor=8"]}

@@ -43,6 +43,7 @@ def decibels(first, second, where):
     return -10.0 * np.log10(np.mean(np.square((first[where].astype(float) - second[where]) / 255.0)))
 
 
+@pytest.mark.long
 def test_tiles_go_on_behind_an_object_better_than_any_diffusion():
     view = camera()
     truth = tiles(view)

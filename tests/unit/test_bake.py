@@ -235,6 +235,7 @@ def test_nothing_is_written_through_a_link_that_leads_out_of_a_bake(ball_scene, 
     assert {path.name: path.read_text() for path in home.iterdir()} == {"letter": "mine", "state.npz": "mine"}
 
 
+@pytest.mark.long
 def test_a_full_disk_is_said_and_leaves_no_complete_bake(ball_scene, own_kernels, tmp_path):
     folder = ball_scene()
     job = bake_worker.BakeJob(scene=str(folder.root), out=str(tmp_path / "bake"), options=QUICK)

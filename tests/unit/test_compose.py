@@ -132,6 +132,7 @@ def test_colours_opacities_and_other_parts_are_unchanged(ball, composed):
     assert (after.splats.centres != begin.splats.centres).any()
 
 
+@pytest.mark.long
 def test_of_three_the_later_yield_to_all_before(ring, ball):
     upper = dataclasses.replace(
         ring,

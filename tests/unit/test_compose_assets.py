@@ -64,6 +64,7 @@ def test_parts_fit_at_the_truth_and_not_at_the_start(name):
         assert common_volume(one, other) == 0
 
 
+@pytest.mark.long
 def test_there_are_eight_pairs_and_one_of_three():
     counts = [len(asset(name).parts) for name in NAMES]
     assert counts.count(2) >= 8 and counts.count(3) >= 1

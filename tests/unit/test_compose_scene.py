@@ -75,6 +75,7 @@ def world(folder, name):
     return load_object_mesh(folder, item).vertices
 
 
+@pytest.mark.long
 def test_penetration_is_resolved_and_other_objects_are_unchanged(scene, tmp_path):
     out, said = tmp_path / "out", []
     request = ComposeRequest(options=PHYSICS, picture=False, splats=1000)

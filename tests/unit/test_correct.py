@@ -125,6 +125,7 @@ def test_matter_motion_and_light_that_were_changed_since_stay(scene):
     assert after.objects[1].material == before.objects[1].material
 
 
+@pytest.mark.long
 def test_on_the_command_line(scene, capsys):
     assert main(["correct", str(scene), "--size", "right=0.5", "--kind", "left=orange", "--report", "--json"]) == 0
     sizes = [item.size_m for item in load_scene(scene).model.objects]

@@ -116,6 +116,7 @@ def test_lift_is_not_found_where_nothing_spins():
     assert weighed.verdict.effects == ("air_drag",)
 
 
+@pytest.mark.long
 @given(st.integers(0, 99), st.floats(2.0, 200.0), st.floats(0.02, 1.0))
 def test_sizes_of_spins_are_those_of_well_seen_takes(seed, across, share):
     rng = np.random.default_rng(seed)

@@ -107,6 +107,7 @@ def test_roughness_is_told_within_a_quarter(roughness, shadow):
     assert found == pytest.approx(roughness, rel=0.25)
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None, phases=(Phase.explicit, Phase.generate))
 @given(
     stripes=st.sampled_from([(DARK, DARK), (DARK, RED), (WHITE, DARK, DARK, DARK, RED, DARK), (RED, RED)]),

@@ -153,6 +153,7 @@ def test_without_gravity_it_is_seen_from_above(root, tmp_path):
     assert scene.objects[0].velocity == pytest.approx((0.98, 1.962, 0))
 
 
+@pytest.mark.long
 def test_the_whole_way(first_fill, root, tmp_path, capsys):
     out = tmp_path / "scene"
     events = []

@@ -57,6 +57,7 @@ def test_part_hidden_by_a_ball_is_completed(tmp_path):
     assert "ball is in front of crate" in messages and "% of it is hidden" in messages
 
 
+@pytest.mark.long
 def test_a_toy_on_a_chair_stands_on_the_chair(tmp_path):
     chair = (np.abs(COLUMNS - 140) < 60) & (np.abs(ROWS - 110) < 55)
     toy = (COLUMNS - 140) ** 2 + (ROWS - 85) ** 2 < 20**2
@@ -85,6 +86,7 @@ def test_of_outlines_that_overlap_the_one_within_the_other_keeps_its_pixels():
         _distinct([chair, chair | toy], ["a", "b"], [False, False])
 
 
+@pytest.mark.long
 def test_the_order_that_was_told_counts(tmp_path):
     left = (np.abs(COLUMNS - 90) < 30) & (np.abs(ROWS - 100) < 40)
     right = (np.abs(COLUMNS - 190) < 30) & (np.abs(ROWS - 110) < 40)

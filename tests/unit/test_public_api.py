@@ -100,6 +100,7 @@ def test_example_scene_to_usd(tmp_path):
     assert height == pytest.approx(0.4 - 4.905 * (3 / 24) ** 2, abs=2e-3)
 
 
+@pytest.mark.long
 def test_example_mujoco_to_scene(tmp_path):
     heights = example("mujoco_to_scene").main(None, tmp_path, frames=4)
     # Free fall over three frames of a 24th of a second.
@@ -107,6 +108,7 @@ def test_example_mujoco_to_scene(tmp_path):
     assert set(heights) == {"hammer", "can"}
 
 
+@pytest.mark.long
 def test_example_sand_and_honey(tmp_path):
     reach = example("sand_and_honey").main(tmp_path, materials=("sand", "water"), frames=6)
     assert 0.0707 < reach["sand"] < reach["water"]
@@ -126,6 +128,7 @@ def test_example_recordings_to_captures(tmp_path):
     np.testing.assert_allclose(c3d.trials[0].points[seen], bag.trials[0].points[seen], atol=1e-6)
 
 
+@pytest.mark.long
 def test_example_csv_to_verdict(tmp_path):
     def slope(_, state):
         v = state[3:]

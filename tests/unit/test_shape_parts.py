@@ -205,6 +205,7 @@ def odd(kind, random):
     return image > 0
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     kind=st.sampled_from(["limbs", "ring", "hair", "border", "lattice", "legs"]),

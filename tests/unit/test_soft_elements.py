@@ -32,6 +32,7 @@ def at(place=(0, 0, 1), velocity=(0, 0, 0), spin=(0, 0, 0), turn=None):
     return State(time=0.0, place=place, velocity=velocity, turn=np.eye(3) if turn is None else turn, spin=spin)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", [trimesh.creation.box((0.05, 0.07, 0.1)), trimesh.creation.icosphere(3, 0.04)])
 def test_the_lattice_fills_the_surface(shape):
     mesh = body_mesh(np.asarray(shape.vertices), np.asarray(shape.faces))

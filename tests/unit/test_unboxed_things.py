@@ -29,6 +29,7 @@ def plain(seed=0):
     return np.full((HEIGHT, WIDTH, 3), (150.0, 120.0, 90.0)) + noise
 
 
+@pytest.mark.long
 def test_coins_that_nobody_boxed_stay_and_are_no_source():
     grey = skimage.data.coins()
     pixels = np.repeat(grey[..., None], 3, axis=2)

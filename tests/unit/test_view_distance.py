@@ -117,6 +117,7 @@ def a_ball(behind):
     return turntable.turned(mesh, np.array([0.0, -2.0, 0.5]))
 
 
+@pytest.mark.long
 def test_a_mirrored_face_is_worse_than_clean_fur_and_its_eyes_count():
     true = a_ball("true")
     numbers = {name: compared(true, a_ball(name)).numbers for name in ("clean", "mirrored")}

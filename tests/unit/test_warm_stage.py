@@ -107,6 +107,7 @@ def test_a_prepared_process_takes_the_first_job(warm):
     assert ask(warm)["pid"] == prepared
 
 
+@pytest.mark.long
 def test_bakes_in_one_process_have_the_bytes_of_bakes_in_their_own(ball_scene, tmp_path, warm):
     """Cancelled in the middle, resumed, and baked again elsewhere: by one worker, which ends with its input."""
     folder, events = ball_scene(), []

@@ -107,6 +107,7 @@ def test_a_wrong_verdict_is_not_confirmed():
     assert result.word == "contradicted" and result.before_rms_m < 2e-3 < result.after_rms_m
 
 
+@pytest.mark.long
 def test_a_spin_that_no_point_shows_is_given_to_the_engine():
     """One tracked point, as of a ball: without its spin the engine has no lift, and would contradict a true verdict."""
 

@@ -40,6 +40,7 @@ def height(worlds: Worlds, world: int) -> float:
     return float((view.positions(0) - view.bodies[0].positions)[:, 2].mean())
 
 
+@pytest.mark.long
 def test_a_soft_body_hangs_where_the_pull_exceeds_its_weight(box, box_body, ceiling, options, similarity, cell):
     """Under a collider, under a soft body whose particles are pinned, under a rigid one a thousand times as heavy that
     rests on a ledge: at 1.25 times the pull that carries it, it hangs for 0.3 s; at 0.75 times it falls by as much as

@@ -129,6 +129,7 @@ def test_ball_keeps_rolling_on_the_level(ball_body, rigid_bodies):
     assert world.pose(0, "ball").velocity[0] == pytest.approx(1.0, rel=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_boxes_stay_stacked(box_body, rigid_bodies, count):
     """Drift below 1 % of the size in 5 s."""
