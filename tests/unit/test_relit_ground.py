@@ -130,3 +130,47 @@ def test_a_deep_shadow_at_the_border_of_the_photo_is_inpainted():
     given, left = relit(photo, hole, np.zeros_like(hole), np.zeros_like(hole))
     assert left[HEIGHT - 20 :].all(), "noise of the deepest shadow would be raised twelvefold"
     assert np.abs(np.log(np.maximum(given, 1.0)) - np.log(np.maximum(photo, 1.0))).max() < 0.7
+
+
+def two_lamps(blur):
+    """The share of light (H, W, 1) past a thing that throws two crisp shadows, which overlap."""
+    return (1.0 - 0.15 * soft(disc(125, 100, 32), blur)) * (1.0 - 0.15 * soft(disc(160, 112, 26), blur))
+
+
+def stain(given, truth, where):
+    """Mean difference of the levels of two pictures within ``where``, over 9 pixels."""
+    weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), 3.0)
+    difference = cv2.GaussianBlur((given - truth).mean(axis=-1) * where, (0, 0), 3.0) / np.maximum(weight, 1e-3)
+    return float(np.abs(difference[where]).mean())
+
+
+def test_crisp_shadows_of_two_lamps_leave_no_stain():
+    truth = 0.35 * wood(3) + 0.65 * wood(3).mean(axis=(0, 1))
+    photo = truth * two_lamps(1.0)
+    thing = disc(85, 85, 24)
+    photo[thing] = (20.0, 40.0, 120.0)
+    hole = cv2.dilate((thing | disc(125, 100, 32) | disc(160, 112, 26)).astype(np.uint8), np.ones((25, 25))) > 0
+    given, left = relit(photo, hole, np.zeros_like(hole), thing)
+    shade = hole & ~thing & (two_lamps(1.0)[..., 0] < 0.9)
+    kept = shade & ~left
+    # The shadows take 17 to 32 of 255, and their edges are as wide as three pixels.
+    assert kept.sum() > 0.8 * shade.sum()
+    assert stain(photo, truth, kept) > 15.0
+    assert stain(given, truth, kept) < 1.5
+
+
+def test_broad_stripes_in_a_shadow_stay():
+    columns = np.arange(WIDTH, dtype=np.float32)
+    stripes = 1.0 + 0.12 * np.sign(np.sin(columns * (2.0 * np.pi / 30.0)))
+    truth = wood(4) * stripes[None, :, None]
+    photo = truth * (1.0 - 0.2 * soft(disc(140, 105, 34), 4.0))
+    thing = disc(90, 80, 26)
+    photo[thing] = (20.0, 40.0, 120.0)
+    hole = disc(140, 105, 50) | disc(90, 80, 36)
+    given, left = relit(photo, hole, np.zeros_like(hole), thing)
+    kept = hole & ~left
+    light, dark = (kept & (np.abs(stripes - level) < 1e-3)[None, :] for level in (1.12, 0.88))
+    assert min(light.sum(), dark.sum()) > 300
+    ratio = float(given[light].mean() / given[dark].mean())
+    # 1.27 by truth; stripes that are taken for shadows would be levelled.
+    assert ratio > 1.2

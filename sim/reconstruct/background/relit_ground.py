@@ -3,10 +3,10 @@
 
 A shadow, or a mirror image that was not wholly taken out, changes the ground's level and leaves its pattern in sight.
 What the level should be is continued from the border of the hole as a membrane (Pérez et al., Poisson image editing,
-SIGGRAPH 2003) over a smooth field of light. The lack is the difference, smoothed at each place over the largest scale
-that explains it as well as finer ones do, by the deviations that the surface's own pattern has at these scales
-(Lepski's rule). Where the lack is too deep, changes too suddenly, or leaves colours that the surface or the border of
-the hole has nowhere, the place is inpainted.
+SIGGRAPH 2003) over a smooth field of light, with what the ground's own autocovariance predicts of its pattern. The
+lack is the difference from that without its detail: a field that is smooth but for steps (``piecewise_light``), which
+are the shadows' edges. Where the lack is too deep, steps too suddenly for a coarse copy, or leaves colours that the
+surface or the border of the hole has nowhere, the place is inpainted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
 
+from .piecewise_light import piecewise_smooth
 from .surface_inpainting import AXES, light_field, logarithms
+from .texture_prediction import predict_texture
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -28,18 +30,25 @@ CELLS = 80_000
 """Largest size of the copy on which levels are compared."""
 MARGIN = 0.6
 """Margin of the photo around the hole, over its larger extent."""
-SCALES = (0.2, 0.1, 0.05, 0.025, 0.0125)
-"""Blurs over the hole's size at which the lack of light is measured."""
-USUAL = 2.5
-"""Deviations of the surface's pattern up to which a coarser scale explains the lack as well as a finer one."""
-EXPECTED = 0.7
-"""The same where the picture was changed, and so certainly is wrong by a little."""
+FINE, COARSE = 0.0125, 0.2
+"""Blurs over the hole's size: of the level along its border, and beyond which a colour is the surface's own."""
+DETAIL = 0.003
+"""Penalty on steps of the lack of light in logarithms times cells, over the hole's size in cells. A shadow of a tenth
+less light is told from the pattern if it is wider than an eighth of the hole."""
+HELD = 5.0
+"""Weight of the known ground, which lacks nothing, over that of a cell of the hole."""
+SUDDEN = 0.06
+"""Deviation in logarithms of the lack from its blurred copy above which it steps too suddenly: the cells' borders would
+show."""
 STRANGE = 3.0
 """The same beyond which a colour is not the surface's."""
 LEAST = 0.015
 """Smallest deviation in logarithms: below it is noise."""
 DEEPEST = 0.5
 """Lack in logarithms of sRGB values, a third of the light, above which noise and the shadow's own tint would show."""
+TINT, TINTED = np.array([0.8, 2.5], dtype=np.float32), 0.2
+"""Most by which a shadow changes the colour differences of ``AXES`` over what it takes of the lightness, and beyond
+that: what changes them more is another surface. On orange wood, which is redder in the shade, it is 0.6 and 1.7."""
 BEYOND = np.array([0.2, 0.1, 0.1], dtype=np.float32)
 """Most by which the level, which follows a smooth field of light, may leave the membrane of the colours around the
 hole, in logarithms, along ``AXES``: a field is a polynomial, and goes off where little is seen."""
@@ -217,35 +226,23 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     slow, _ = light_field(cells.logs, cells.known, cells.hole)
     pattern = cells.logs - slow
     # The border's level, not its single pixels, is continued inside.
-    both = np.concatenate([pattern, cells.logs], axis=-1).astype(np.float32)
-    border = smoothed(both, cells.known, max(1.0, SCALES[-1] * cells.side))
-    both = membrane(np.where(cells.known[..., None], border, 0.0).astype(np.float32), cells.known, cells.hole)
+    both = _continued_border(np.concatenate([pattern, cells.logs], axis=-1).astype(np.float32), cells)
     level, around_it = both[..., :3], both[..., 3:]
     beyond = (np.abs((slow + level - around_it) @ AXES.T) > BEYOND).any(axis=-1)
-    ground = cells.known | (cells.hole & ~cells.core)
-    difference = np.where(ground[..., None], level - pattern, 0.0).astype(np.float32)
-    blurs = [max(1.0, scale * cells.side) for scale in SCALES]
-    means = [smoothed(difference, ground, blur) @ AXES.T for blur in blurs]
-    usual = [smoothed(pattern, cells.known, blur) @ AXES.T for blur in blurs]
     away = cv2.distanceTransform((~cells.hole).astype(np.uint8), cv2.DIST_L2, 5)
     around = cells.known & (away > 2.0)
     if around.sum() < FEWEST:
         around = cells.known
     altered = np.zeros_like(cells.hole) if changed is None else changed
-    most = np.where(altered, EXPECTED, USUAL).astype(np.float32)
-    chosen, sudden = means[-1].copy(), np.zeros_like(cells.hole)
-    for coarse in range(len(blurs) - 2, -1, -1):
-        fits = np.ones(cells.hole.shape, dtype=bool)
-        for fine in range(coarse + 1, len(blurs)):
-            spread = np.maximum(_spread((usual[fine] - usual[coarse])[around]), LEAST)
-            fits &= (np.abs(means[fine] - means[coarse]) < most[..., None] * spread).all(axis=-1)
-            if coarse == len(blurs) - 2:
-                sudden = (np.abs(means[fine] - means[coarse]) > USUAL * spread).any(axis=-1)
-        chosen = np.where(fits[..., None], means[coarse], chosen)
-    lack = np.asarray(cv2.GaussianBlur(chosen.astype(np.float32), (0, 0), 1.0))
+    chosen = _steps(((level + _foreseen(pattern, cells) - pattern) @ AXES.T).astype(np.float32), cells)
+    blurred = cv2.GaussianBlur(chosen, (0, 0), max(1.0, FINE * cells.side))
+    sudden = (np.abs(chosen - blurred) > SUDDEN).any(axis=-1)
+    usual = smoothed(pattern, cells.known, max(1.0, COARSE * cells.side)) @ AXES.T
+    lack = np.asarray(cv2.GaussianBlur(chosen, (0, 0), 1.0))
     axes = pattern @ AXES.T
     own = axes - level @ AXES.T + lack
-    strange = np.abs(own) > STRANGE * np.maximum(_spread((axes - usual[0])[around]), 2.0 * LEAST)
+    strange = np.abs(own) > STRANGE * np.maximum(_spread((axes - usual)[around]), 2.0 * LEAST)
+    strange[..., 1:] |= np.abs(lack[..., 1:]) > TINT * np.abs(lack[..., :1]) + TINTED
     trusted = ~strange.any(axis=-1) & (np.abs(lack[..., 0]) < DEEPEST) & ~cells.core & ~sudden
     told = trusted & cells.hole
     trusted &= ~beyond & ((told & beyond).sum() <= MOSTLY * told.sum())
@@ -260,6 +257,35 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     lack[..., 0] = np.where(altered, lack[..., 0], np.maximum(lack[..., 0], 0.0))
     back = lack @ np.linalg.inv(AXES).T.astype(np.float32)
     return np.asarray(back, dtype=np.float32), np.asarray(trusted)
+
+
+def _continued_border(values: Picture, cells: _Cells) -> Picture:
+    """``values`` (h, w, c) of the known cells, and in the hole their level along its border continued as a membrane."""
+    border = smoothed(values, cells.known, max(1.0, FINE * cells.side))
+    return membrane(np.where(cells.known[..., None], border, 0.0).astype(np.float32), cells.known, cells.hole)
+
+
+def _foreseen(pattern: Picture, cells: _Cells) -> Picture:
+    """What the known cells predict of ``pattern`` (h, w, 3) in the hole beyond its level; 0 elsewhere.
+
+    Broad stripes would else be taken for shadows.
+    """
+    values = np.where(cells.known[..., None], pattern - pattern[cells.known].mean(axis=0), 0.0).astype(np.float32)
+    found, _ = predict_texture(values, cells.known, cells.hole)
+    return np.where(cells.hole[..., None], found - _continued_border(found, cells), 0.0).astype(np.float32)
+
+
+def _steps(difference: Picture, cells: _Cells) -> Picture:
+    """``difference`` (h, w, 3) of the hole's visible ground without its detail, over all of the hole; 0 elsewhere."""
+    near = cv2.dilate(cells.hole.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    window = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+    hole, seen = cells.hole[window], (cells.hole & ~cells.core)[window]
+    weight = np.where(cells.known[window], HELD, seen).astype(np.float32)
+    values = np.where(seen[..., None], difference[window], 0.0).astype(np.float32)
+    result = np.zeros_like(difference)
+    result[window] = np.where(hole[..., None], piecewise_smooth(values, weight, DETAIL * cells.side), 0.0)
+    return result
 
 
 def _spread(values: Picture) -> Picture:
