@@ -135,3 +135,36 @@ def test_what_a_mask_lacks_above_its_foot_leaves_with_it_and_a_stand_stays():
     grain += 20.0 * np.random.default_rng(2).normal(size=grain.shape)
     (none,) = remnants(np.clip(grain, 0, 255).astype(np.uint8), [TOY])
     assert not none.any()
+
+
+def test_the_line_between_wall_and_floor_is_no_part_of_what_stands_before_it():
+    wall = np.where(ROWS[..., None] < 110, 150.0, 195.0) * np.ones((1, 1, 3))
+    (beside,) = remnants(photo(wall, [(EAR, (235, 235, 235)), (TOY, (200, 110, 40))]), [TOY])
+    line = (np.abs(ROWS - 110) < 4) & (np.abs(COLUMNS - 160) > 100)
+    assert (beside & EAR & ~TOY).sum() > 0.95 * (EAR & ~TOY).sum()
+    assert not (beside & line).any()
+
+
+def bag(background):
+    """A bag of coarse cloth that the photo's left and lower border cut, with a strap."""
+    body = (np.abs(COLUMNS - 90) < 92) & (ROWS > 100)
+    strap = ellipse(215, 120, 40, 90) & ~ellipse(215, 120, 30, 78)
+    whole = body | strap
+    cloth = 70.0 + np.random.default_rng(1).normal(0.0, 30.0, (int(whole.sum()), 1))
+    return photo(background, [(whole, cloth)]), whole
+
+
+def test_a_thing_that_the_border_cuts_is_found_whole_on_a_white_page():
+    picture, whole = bag(WHITE)
+    assert plain_backdrop(picture) is not None
+    found = things_before_backdrop(picture, [Proposal((180.0, 30.0, 260.0, 215.0), 0.9)])
+    assert len(found) == 1
+    assert holds(found[0].box, whole)
+
+
+def test_a_grey_wall_or_a_white_sky_behind_what_the_border_cuts_is_no_page():
+    assert plain_backdrop(bag((170, 170, 170))[0]) is None
+    street = np.where(ROWS[..., None] < 190, 252.0, 120.0) * np.ones((1, 1, 3))
+    house = (COLUMNS < 120) & (ROWS > 40)
+    bricks = 70.0 + np.random.default_rng(1).normal(0.0, 30.0, (int(house.sum()), 1))
+    assert plain_backdrop(photo(street, [(house, bricks)])) is None
