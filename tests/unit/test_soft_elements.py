@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import taichi as ti
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -136,3 +137,39 @@ def test_a_pellet_keeps_the_mass_and_moves_its_centre(fraction, offset):
     loaded = concentrated_masses(mesh.nodes, masses, fraction, centre + np.array(offset))
     assert loaded.sum() == pytest.approx(masses.sum())
     assert np.allclose(loaded @ mesh.nodes / masses.sum(), centre + fraction * np.array(offset), atol=1e-6)
+
+
+def test_the_logarithm_is_that_of_the_library():
+    from physgen.sim.diagnose.soft import element_kernels as kernels
+
+    box_worlds = worlds(box())
+    box_worlds.run([SimulationJob(start=at(), world=FREE, times=np.array([1e-3]))])  # starts Taichi
+
+    @ti.kernel
+    def logarithms(ratios: kernels.Reals, found: kernels.Reals):
+        for i in range(ratios.shape[0]):
+            found[i] = kernels.logarithm(ratios[i])
+
+    ratios = np.concatenate([np.linspace(0.15, 8.0, 3001), 1.0 + np.geomspace(1e-14, 1e-2, 200), [1.0]])
+    found = np.zeros_like(ratios)
+    logarithms(ratios, found)
+    assert np.allclose(found, np.log(ratios), rtol=4e-16 * 2, atol=0)
+
+
+def test_fibres_along_a_bar_carry_a_wave_like_a_stiffer_bar():
+    """Without lateral contraction a bar of modulus E with fibres of modulus k is a bar of modulus E + k."""
+    long, fall = 0.2, 0.3
+    mesh = box((long, 0.02, 0.02), (24, 2, 2))
+    upright = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    times = np.arange(1, 250) * 1e-4
+    start = at(place=(0, 0, long / 2), velocity=(0, 0, -fall), turn=upright)
+    base = dataclasses.replace(FREE, poisson_ratio=0.0)
+    models = [
+        dataclasses.replace(base, fibre=1e5, axis=(1.0, 0.0, 0.0)),
+        dataclasses.replace(base, factor=2.0, contact=0.5),
+        base,
+    ]
+    jobs = [SimulationJob(start=start, world=world, times=times) for world in models]
+    (fibred, stiffer, plain), _ = worlds(mesh, np.array([[-long / 2, 0, 0]])).run(jobs)
+    apart = np.abs(fibred - stiffer).max()
+    assert apart < 0.02 * np.abs(fibred - plain).max()

@@ -48,6 +48,9 @@ CONTACT_LIMIT = 1.0
 CRUSHED = 0.15
 """Lower bound of the volume ratio of a cell."""
 
+ROOT_HALF, LOG_SHIFT = 0x3FE6A09E, 0x3FF00000 - 0x3FE6A09E
+"""High words of the square root of 1/2 in double precision, and of the step from there to 1."""
+
 
 class MeshArrays(NamedTuple):
     """Tetrahedral mesh of the body at rest: T cells, N nodes."""
@@ -159,9 +162,32 @@ def yielded(F: mat3, inverse: mat3, plastic: mat3, mu: real, lam: real, limit: r
     return plus(2.0 * mu * dev, (lam + 2.0 / 3.0 * mu) * volume), after
 
 
+@ti.func
+def logarithm(x: real):
+    """Return ln x of a positive x by FreeBSD's e_log.c: no call, which would save and load all registers per cell."""
+    shifted = ti.bit_cast(x, ti.i64) + ti.i64(LOG_SHIFT << 32)
+    m = ti.bit_cast((shifted & ti.i64((1 << 52) - 1)) + ti.i64(ROOT_HALF << 32), real)
+    f = m - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    w = z * z
+    even = w * (real(0.3999999999940941908) + w * (real(0.2222219843214978396) + w * real(0.1531383769920937332)))
+    odd = w * (real(0.2857142874366239149) + w * (real(0.1818357216161805012) + w * real(0.1479819860511658591)))
+    odd = z * (real(0.6666666666666735130) + odd)
+    half = 0.5 * f * f
+    exponent = ti.cast((shifted >> 52) - 1023, real)
+    return exponent * real(0.6931471805599453094) + (f - (half - s * (half + even + odd)))
+
+
 @func
 def inner_forces(
-    w: ti.i32, worlds: Reals2, damped: ti.template(), yields: ti.template(), mesh: MeshArrays, state: NodeState
+    w: ti.i32,
+    worlds: Reals2,
+    damped: ti.template(),
+    yields: ti.template(),
+    fibred: ti.template(),
+    mesh: MeshArrays,
+    state: NodeState,
 ):
     """Add the internal forces of world w to f (worlds, nodes) and update plastic strain where it yields."""
     grade = vec3(worlds[w, GRADE], worlds[w, GRADE + 1], worlds[w, GRADE + 2])
@@ -178,12 +204,12 @@ def inner_forces(
         x0 = state.x[w, n0]
         shape = mesh.shapes[t]
         F = ti.Matrix.cols([state.x[w, n1] - x0, state.x[w, n2] - x0, state.x[w, n3] - x0]) @ shape
-        J = F.determinant()
-        # A nearly crushed or inverted cell is still pushed open: the cofactors point there.
         cofactors = ti.Matrix.cols(
             [column(F, 1).cross(column(F, 2)), column(F, 2).cross(column(F, 0)), column(F, 0).cross(column(F, 1))]
         )
-        back = cofactors / ti.max(J, CRUSHED)
+        # A nearly crushed or inverted cell is still pushed open: the cofactors point there.
+        J = ti.max(column(F, 0).dot(column(cofactors, 0)), CRUSHED)
+        back = cofactors / J
         inverse = back.transpose()
         stress = mat3(0.0)
         if ti.static(yields):
@@ -191,8 +217,8 @@ def inner_forces(
             state.plastic[w, t] = after
             stress = tau @ back
         else:
-            stress = mu * (F - back) + (lam * ti.log(ti.max(J, CRUSHED))) * back
-        if fibre > 0.0:
+            stress = mu * F + ((lam * logarithm(J) - mu) / J) * cofactors
+        if ti.static(fibred):
             along = F @ axis
             s = along.norm() + 1e-12
             stress += (mesh.shares[t] * fibre * (s - 1.0) / s) * along.outer_product(axis)
@@ -203,7 +229,7 @@ def inner_forces(
             for i in ti.static(range(3)):
                 tau_v[i, i] += lam * rate.trace()
             stress += worlds[w, DAMPING] * (tau_v @ back)
-        H = (-mesh.volumes[t]) * (stress @ shape.transpose())
+        H = stress @ (-mesh.volumes[t] * shape).transpose()
         h1 = vec3(H[0, 0], H[1, 0], H[2, 0])
         h2 = vec3(H[0, 1], H[1, 1], H[2, 1])
         h3 = vec3(H[0, 2], H[1, 2], H[2, 2])
@@ -243,6 +269,7 @@ def advance_worlds(
     worlds: Reals2,
     damped: ti.template(),
     yields: ti.template(),
+    fibred: ti.template(),
     keep: ti.template(),
     mesh: MeshArrays,
     state: NodeState,
@@ -250,7 +277,8 @@ def advance_worlds(
 ):
     """Advance every world from its START through its times and write the tracked points.
 
-    worlds (W, WORLD_ROW): parameters. keep: also write positions and internal accelerations of all nodes.
+    worlds (W, WORLD_ROW): parameters. damped, yields, fibred: whether they have viscosity, a yield stress, fibres.
+    keep: also write positions and internal accelerations of all nodes.
     """
     ti.loop_config(block_dim=1)
     for w in range(worlds.shape[0]):
@@ -281,7 +309,7 @@ def advance_worlds(
                         common[2] -= worlds[w, ADHESION]
                 for n in range(state.x.shape[1]):
                     state.f[w, n] = vec3(0.0)
-                inner_forces(w, worlds, damped, yields, mesh, state)
+                inner_forces(w, worlds, damped, yields, fibred, mesh, state)
                 if ti.static(keep):
                     begun = step == 0 and frame > 0
                     for n in range(state.x.shape[1] if begun else 0):

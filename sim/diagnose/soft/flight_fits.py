@@ -105,6 +105,7 @@ class Flights:
         self._flights: dict[int, FlightFrames] = {}
         self._starts: dict[tuple[object, ...], State | None] = {}
         self._last: dict[int, tuple[State, Inertia]] = {}
+        self._lasting: dict[tuple[int, WorldParameters, bytes], Array] = {}
 
     def flight(self, index: int) -> FlightFrames:
         """Return the flying frames of trial ``index``."""
@@ -203,11 +204,14 @@ class Flights:
 
     def lasting_motion(self, indices: list[int], world: list[WorldParameters], times: list[Array]) -> list[Array]:
         """Return as ``motion``; where a simulation fails, the body continues as a rigid one stopped by the ground."""
-        found = self.motion(indices, world, times)
-        return [
-            p if is_plausible(p) else self._stopped(i, a, t)
-            for p, i, a, t in zip(found, indices, world, times, strict=True)
-        ]
+        # Believed and found motions are asked for by scores, curves and localisation.
+        keys = [(i, a, t.tobytes()) for i, a, t in zip(indices, world, times, strict=True)]
+        new = [n for n, key in enumerate(keys) if key not in self._lasting and key not in keys[:n]]
+        found = self.motion([indices[n] for n in new], [world[n] for n in new], [times[n] for n in new])
+        for n, points in zip(new, found, strict=True):
+            stopped = not is_plausible(points)
+            self._lasting[keys[n]] = self._stopped(indices[n], world[n], times[n]) if stopped else points
+        return [self._lasting[key] for key in keys]
 
     def _stopped(self, index: int, world: WorldParameters, times: Array) -> Array:
         """Return points (T, K, 3) of a flight under ``world``, lifted wherever the body would penetrate the ground."""

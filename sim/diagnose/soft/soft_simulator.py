@@ -19,6 +19,9 @@ from .soft_candidates import WorldParameters
 
 Array = NDArray[np.float64]
 
+Laws = tuple[bool, bool, bool]
+"""Whether worlds have viscosity, a yield stress, fibres: each set of laws is a kernel of its own."""
+
 CONTACT = 3.0
 """Ground stiffness per area, times cell width over Young's modulus: little penetration at ordinary impact speeds, no
 much shorter step than the material's own."""
@@ -174,15 +177,16 @@ class SoftWorlds:
         """Return tracked points (T, K, 3) of each job; with ``keep`` also the nodes' histories."""
         points: list[Array | None] = [None] * len(jobs)
         histories: list[NodeHistory | None] = [None] * len(jobs)
-        groups: dict[tuple[bool, bool], list[int]] = {}
+        groups: dict[Laws, list[int]] = {}
         for i, job in enumerate(jobs):
-            groups.setdefault((job.world.damping > 0, job.world.yield_stress > 0), []).append(i)
-        for (damped, yields), members in groups.items():
+            laws = job.world.damping > 0, job.world.yield_stress > 0, job.world.fibre > 0
+            groups.setdefault(laws, []).append(i)
+        for laws, members in groups.items():
             # Longest first: a free thread takes the next.
             members.sort(key=lambda i: -(jobs[i].times[-1] - jobs[i].start.time) / self.step(jobs[i].world))
             shorter = 1.0
             for _ in range(RETRIES + 1):
-                for i, found, history in self._launch(jobs, members, damped, yields, keep, shorter):
+                for i, found, history in self._launch(jobs, members, laws, keep, shorter):
                     points[i], histories[i] = found, history
                 # Crushed material is stiffer than the step allows for.
                 members = [i for i in members if not is_plausible(points[i])]
@@ -192,16 +196,16 @@ class SoftWorlds:
         return [p for p in points if p is not None], [h for h in histories if h is not None]
 
     def _launch(
-        self, jobs: Sequence[SimulationJob], members: list[int], damped: bool, yields: bool, keep: bool, shorter: float
+        self, jobs: Sequence[SimulationJob], members: list[int], laws: Laws, keep: bool, shorter: float
     ) -> list[tuple[int, Array, NodeHistory | None]]:
         nodes, frames = len(self.mesh.nodes), max(len(jobs[i].times) for i in members)
-        row = 8 * (9 * nodes + 3 * frames * len(self.holders) + (9 * len(self.mesh.cells) if yields else 0))
+        row = 8 * (9 * nodes + 3 * frames * len(self.holders) + (9 * len(self.mesh.cells) if laws[1] else 0))
         row += 48 * frames * nodes if keep else 0
         most = max(1, MOST_BYTES // row)
         out: list[tuple[int, Array, NodeHistory | None]] = []
         for start in range(0, len(members), most):
             chosen = members[start : start + most]
-            out += self._launch_some([jobs[i] for i in chosen], chosen, frames, damped, yields, keep, shorter)
+            out += self._launch_some([jobs[i] for i in chosen], chosen, frames, laws, keep, shorter)
         return out
 
     def _launch_some(
@@ -209,8 +213,7 @@ class SoftWorlds:
         jobs: list[SimulationJob],
         names: list[int],
         frames: int,
-        damped: bool,
-        yields: bool,
+        laws: Laws,
         keep: bool,
         shorter: float,
     ) -> list[tuple[int, Array, NodeHistory | None]]:
@@ -218,6 +221,7 @@ class SoftWorlds:
         from . import element_kernels as kernels
 
         mesh, count, nodes = self.mesh, len(jobs), len(self.mesh.nodes)
+        damped, yields, fibred = laws
         times = np.zeros((count, frames))
         x, v = np.zeros((count, nodes, 3)), np.zeros((count, nodes, 3))
         for i, job in enumerate(jobs):
@@ -237,6 +241,7 @@ class SoftWorlds:
             rows,
             damped,
             yields,
+            fibred,
             keep,
             kernels.MeshArrays(
                 cells=np.ascontiguousarray(mesh.cells, dtype=np.int32),
