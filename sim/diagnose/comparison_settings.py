@@ -65,3 +65,7 @@ class ComparisonSettings:
 
 VOCABULARY = 19
 """Number of effects that share the prior, whichever were tested."""
+
+SHARED = 4.0
+"""Factor on the variance of parameters: trials of one recording share model errors. The same as ``temperature``, and
+what the truth's distance from the fits shows (docs/measurements.md)."""

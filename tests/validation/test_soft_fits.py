@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.soft.body_mesh import body_mesh
+from physgen.sim.diagnose.soft.candidate_survey import Survey
+from physgen.sim.diagnose.soft.contact_search import CandidateSearch, ContactProblem
 from physgen.sim.diagnose.soft.flight_fits import Flights, GroundFrame, fit_in_flight, soft_trial
 from physgen.sim.diagnose.soft.free_flight import State
 from physgen.sim.diagnose.soft.soft_candidates import WorldParameters, candidates
 from physgen.sim.diagnose.soft.soft_fits import fit_soft
 from physgen.sim.diagnose.soft.soft_simulator import SimulationJob, SoftWorlds
+from physgen.sim.diagnose.work import Work
 from physgen.sim.errors import Cancelled, InputError
+from physgen.sim.events import ignore, never
 from scipy.spatial.transform import Rotation
 
 SIGMA = 5e-4
@@ -192,6 +196,24 @@ def test_no_effect_is_found_in_plain_motion():
     found = fits(made, ["stiffness", "internal_damping", "friction", "buoyancy"])
     assert found.nominal.misfit < 1.1
     assert max(c.log_evidence for c in found.candidates) < found.refitted.log_evidence + 3
+
+
+def test_parameters_are_as_sure_as_trials_that_share_errors_and_two_lattices_make_them():
+    made, _ = capture(dataclasses.replace(NOMINAL, factor=0.8), after=0.02)
+    survey = Survey(made, on_event=ignore, cancelled=never, work=Work())
+    (stiffness,) = candidates(NOMINAL, 0.03, np.zeros(3))["stiffness"]
+    one, size = survey.problem, 0.03
+    four = ContactProblem(survey.flights, one.windows * 4, one.base, model_error=one.model_error, size=size)
+    searches = [CandidateSearch(problem, stiffness) for problem in (one, four)]
+    free = np.array([np.log(0.8), 0.0, 0.0])
+    fit, repeated = (search.with_jacobians(search.try_all([free])[0]) for search in searches)
+    # Four times the same trials, sharing their errors, are worth one.
+    shared = searches[1].covariance(repeated)
+    assert np.allclose(shared, np.linalg.inv(searches[0].normal_equations(fit)[1]), rtol=1e-6, atol=0)
+    assert 1e-4 < np.sqrt(shared[0, 0]) < 0.05
+    moved = np.array([-0.03, 9.0, 0.0])
+    added = searches[1].covariance(repeated, moved) - shared
+    assert np.allclose(added, np.diag([(0.03 / 1.96) ** 2, searches[1].spread[1] ** 2, 0.0]), atol=1e-12)
 
 
 def test_unsupported_captures_are_reported():

@@ -15,6 +15,7 @@ from ...effects.registry import effect
 from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, Trial
+from ..comparison_settings import SHARED
 from ..diagnosis import CandidateFit, Discrepancy, Estimate
 from ..work import Work
 from .bending import bending
@@ -258,10 +259,6 @@ def _assemble(capture: Capture, bodies: list[BodyFits]) -> RigidFits:
         grain_rms_m=float(np.sqrt(np.mean(np.square(grains)))),
     )
 
-
-SHARED = 4.0
-"""Factor on the variance of parameters: trials of one recording share model errors. The same as the temperature of the
-comparison, and what the truth's distance from the fits shows (docs/measurements.md)."""
 
 PAIRS_SHOWN = 3
 """Best pairs that are judged."""

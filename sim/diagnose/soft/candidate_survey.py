@@ -60,11 +60,15 @@ FREEDOM = 4.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FoundFit:
-    """A fit, the search that found it, and the effects added before the candidate's own."""
+    """A fit, the search that found it, and the effects added before the candidate's own.
+
+    moved: (p + 2,) from the optimum on the coarse lattice to that on the fine one, None where one of both is unknown.
+    """
 
     search: CandidateSearch
     fit: ContactFit
     in_flight: FlightEstimate | None = None
+    moved: Array | None = None
     before: tuple[tuple[str, dict[str, float], FlightEstimate], ...] = ()
 
     @property
@@ -188,7 +192,7 @@ class Survey:
         found.sort(key=lambda entry: entry[0])
         out = []
         for rank, (_, candidate, end) in enumerate(found):
-            search = CandidateSearch(problem, candidate)
+            search, away = CandidateSearch(problem, candidate), None
             near = rank < FULL_SEARCHES and len(candidate.mean) == 1
             first = np.eye(len(end.free))[0]
             about = [end.free + d * first for d in (NEARBY if near else (0.0,))]
@@ -196,14 +200,16 @@ class Survey:
             if rank == 0:
                 # The best one is always refined: report and predictions depend on it.
                 fit = search.descend(fit, LAST_ROUNDS, self._leave)
+                away = fit.free - end.free
             elif rank < FULL_SEARCHES and not self._late(0.6):
                 fit = search.descend(fit, FINE_ROUNDS, self._stop)
+                away = fit.free - end.free
             else:
                 if rank < FULL_SEARCHES:
                     self._work.skip((*self._names, candidate.name), "refined on the fine lattice")
                 fit = dataclasses.replace(fit, jacobians=end.jacobians)
             self._report(50 + 30 * (rank + 1) // len(found), candidate.name)
-            out.append(FoundFit(search=search, fit=fit))
+            out.append(FoundFit(search=search, fit=fit, moved=away))
         return out
 
     def _pairs(self, tried: list[Candidate]) -> list[FoundFit]:

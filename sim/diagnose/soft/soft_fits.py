@@ -216,7 +216,7 @@ class SoftFits:
         by_trial = -0.5 * flights
         for window, score in zip(self._survey.problem.windows, scores, strict=True):
             by_trial[self._fit_trials.index(window.trial)] += score
-        covariance = search.covariance(fit)
+        covariance = search.covariance(fit, found.moved)
         draws = np.random.default_rng(0).multivariate_normal(fit.free, covariance, size=DRAWS, method="eigh")
         parameters = {name: _estimates(name, [values], values) for name, values, _ in found.before}
         if search.candidate is not None:
