@@ -131,7 +131,8 @@ class Survey:
         end = min((rough.descend(g, ROUNDS, self._stop) for g in grounds), key=lambda f: f.cost)
         self._common = end.free
         self.believed, refitted = neutral.try_all([neutral.mean, end.free])
-        refitted = neutral.descend(min(self.believed, refitted, key=lambda f: f.cost), 2, self._stop)
+        # As far as the best effect: an unfinished re-fit would leave a gain to whatever starts from it.
+        refitted = neutral.descend(min(self.believed, refitted, key=lambda f: f.cost), LAST_ROUNDS, self._stop)
         self.plain = FoundFit(search=neutral, fit=refitted)
         self._report(10, "nominal model")
         self.flight_chi2 = np.array([self.flights.fit(i, base).chi2 for i in self.fit_trials])
