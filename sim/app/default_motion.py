@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.folder import Scene
+from ..scene.folder import Scene, load_scene
 from ..scene.model import Ground, SceneModel, SceneObject, Vector
 from .free_space import Clearance, PlateColours, Thing, outside_frame, thing_at_rest, with_supports
 
@@ -148,7 +148,9 @@ class DefaultMotion:
             for item in scene.objects
         )
         model = dataclasses.replace(scene.model, objects=objects)
-        return scene if model == scene.model else scene.with_model(model).save()
+        moved = scene if model == scene.model else scene.with_model(model)
+        # A rehearsal of another motion may have saved that.
+        return moved if load_scene(scene.root).model == model else moved.save()
 
 
 def default_motion(

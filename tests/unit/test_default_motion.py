@@ -236,7 +236,16 @@ def test_what_has_no_room_is_left_alone_and_that_is_said(table):
         save_scene((t := table([(0, 0, 0, 0.1, 0.1, 0.1)])).root, dataclasses.replace(t.model, gravity=(0, 0, 0.0))),
     ):
         motion = default_motion(scene)
-        assert motion.moves == () and "nothing moves" in motion.sentence and motion.applied(scene) is scene
+        assert motion.moves == () and "nothing moves" in motion.sentence and motion.applied(scene).model == scene.model
+
+
+def test_what_a_rehearsal_set_in_motion_is_at_rest_again_where_nothing_moves(table):
+    """The bake's process reads the scene from its folder, and refuses another one than it was given."""
+    scene = table([(0, 0, 0, 0.1, 0.1, 0.1)])
+    motion = default_motion(scene)
+    assert motion.moves and load_scene(motion.applied(scene).root).model != scene.model
+    still = dataclasses.replace(motion, moves=()).applied(scene)
+    assert still.model == scene.model == load_scene(scene.root).model
 
 
 def test_a_request_that_says_how_things_move_is_left_alone():
