@@ -162,6 +162,15 @@ def test_a_thing_that_the_border_cuts_is_found_whole_on_a_white_page():
     assert holds(found[0].box, whole)
 
 
+def test_the_box_of_a_thing_that_touches_all_sides_leaves_a_rim():
+    whole = ellipse(160, 120, 162, 122)
+    cloth = 70.0 + np.random.default_rng(1).normal(0.0, 30.0, (int(whole.sum()), 1))
+    (found,) = things_before_backdrop(photo(WHITE, [(whole, cloth)]), [])
+    x0, y0, x1, y1 = found.box
+    # Above 0.98 a box is refused: it leaves nothing around the object.
+    assert 0.9 < (x1 - x0) * (y1 - y0) / (WIDTH * HEIGHT) < 0.98
+
+
 def test_a_grey_wall_or_a_white_sky_behind_what_the_border_cuts_is_no_page():
     assert plain_backdrop(bag((170, 170, 170))[0]) is None
     street = np.where(ROWS[..., None] < 190, 252.0, 120.0) * np.ones((1, 1, 3))

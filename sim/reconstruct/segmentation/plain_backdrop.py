@@ -52,6 +52,8 @@ LOOSE = 0.02
 """Margin of a box around a thing, over its longer side."""
 FULL = 0.95
 """Share of the photo above which a box has no margin: nothing would be left around it."""
+INSET = 0.006
+"""Least distance of such a box from the photo's border, over the photo's sides."""
 SCORE = 0.95
 """Score of a thing before a plain backdrop."""
 WHOLE = 0.995
@@ -284,7 +286,9 @@ def _loose(mask: Mask) -> Box:
     wide = (max(0.0, x0 - margin), max(0.0, y0 - margin), min(width, x1 + margin), min(height, y1 + margin))
     if (wide[2] - wide[0]) * (wide[3] - wide[1]) < FULL * mask.size:
         return wide
-    return (max(0.0, x0), max(0.0, y0), min(width, x1), min(height, y1))
+    # A box around all of the photo would leave nothing to learn the backdrop's colours from.
+    across, down = INSET * width, INSET * height
+    return (max(across, x0), max(down, y0), min(width - across, x1), min(height - down, y1))
 
 
 def _behind(lab: NDArray[np.float32], backdrop: Mask) -> NDArray[np.float32]:
