@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..composite.srgb import read_rgb
-from ..diagnose.track.track_videos import MAX_SIDE, Video, VideoInfo
+from ..diagnose.track.video_file import MAX_SIDE, Video, VideoInfo
 from ..errors import InputError
 from ..files import shown
 from ..validation import require_range

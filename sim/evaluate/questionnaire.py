@@ -23,7 +23,7 @@ from PIL import Image
 from ..atomic import replacing_tree, write_bytes, write_json
 from ..cache.folder_lock import lock_beside
 from ..composite.srgb import read_rgb
-from ..diagnose.track.track_videos import Video
+from ..diagnose.track.video_file import Video
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file, open_file, read_toml, shown

@@ -11,7 +11,7 @@ from loaders import BOX, MASK, PIXELS, RANDOM, add, put_json, put_picture
 from physgen.physgen_addon.frames.frame_files import Part, write_exr
 from physgen.sim.composite.srgb import read_mask as read_scene_mask
 from physgen.sim.composite.srgb import read_rgb
-from physgen.sim.diagnose.track.track_videos import Video
+from physgen.sim.diagnose.track.video_file import Video
 from physgen.sim.gaussians.views.view_files import read_views
 from physgen.sim.importers.coco_masks import masks_from_json
 from physgen.sim.importers.image_masks import masks_from_array_file, masks_from_image

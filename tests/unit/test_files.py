@@ -15,7 +15,7 @@ from physgen.batch.cli import main
 from physgen.sim.cache.bake_folder import disk_usage, load_bake
 from physgen.sim.cache.pc2 import Pc2Reader
 from physgen.sim.diagnose.track import initial_pose
-from physgen.sim.diagnose.track.track_videos import Video
+from physgen.sim.diagnose.track.video_file import Video
 from physgen.sim.errors import InputError
 from physgen.sim.files import VIDEO_VARIABLE, name_for_ffmpeg, open_file, read_bytes, read_text, read_toml
 from physgen.sim.html import page_head, require_harmless

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .pose_estimation import Array
-from .track_videos import Video
 from .video_background import (
     Aligner,
     Picture,
@@ -29,6 +28,7 @@ from .video_background import (
     still_background,
     warped,
 )
+from .video_file import Video
 
 LEAST_CONTRAST, NOISE_FACTOR = 13.0, 5.0
 """Difference from the background that counts as moving: grey levels, and standard deviations of the pixel."""

@@ -22,7 +22,7 @@ from .path_relations import bodies, shown_share
 from .pose_estimation import Array
 from .region_track import link_regions, true_times, with_missing_frames
 from .track_input import BodyRequest, VideoTrial
-from .track_videos import Video
+from .video_file import Video
 
 STAGE = "track"
 MOST_FRAMES = 160

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .pose_estimation import Array
-from .track_videos import Frame, Video
+from .video_file import Frame, Video
 
 Picture = NDArray[np.uint8]
 WORK_PIXELS = 520_000
