@@ -130,14 +130,22 @@ class CleanPlate:
             [mask | self._mask(item.shadow) for mask, item in zip(masks, self._scene.objects, strict=True)]
         )
         edges = [disocclusion.inner_rim(mask) for mask in masks]
+        self._outskirts = self._outside()
         self._rims = self._around(
-            [
-                np.maximum(disocclusion.rim_strength(mask, self.masks), edge.astype(np.float32))
-                for mask, edge in zip(masks, edges, strict=True)
-            ]
+            [np.maximum(outside, edge.astype(np.float32)) for outside, edge in zip(self._outskirts, edges, strict=True)]
         )
         self._cores: NDArray[np.bool_] = self.masks & ~np.logical_or.reduce(edges)
         self._behind = self.photo
+
+    def _outside(self) -> list[NDArray[np.float32]]:
+        """Return per object the share (H, W) of the pixels beside its mask that leave with it as soon as it moves."""
+        rims = [disocclusion.rim_strength(mask, self.masks) for mask in self.object_masks]
+        # Mirror images beside an object are the ground's, and brighter or darker than it.
+        if not rims or self._scene.ground_plane.reflectivity > 0.0:
+            return rims
+        shadow = np.logical_or.reduce([self._mask(item.shadow) for item in self._scene.objects])
+        left = disocclusion.remains(self.photo, self.background, self.object_masks, shadow)
+        return [np.maximum(rim, rest) for rim, rest in zip(rims, left, strict=True)]
 
     def show_behind(self, layer: ObjectLayer) -> None:
         """Use at rest, behind the soft outlines of the objects, ``layer`` at rest, what the photo shows there."""
@@ -147,11 +155,8 @@ class CleanPlate:
         self._behind = behind(self.photo, layer)
         self._rims = self._around(
             [
-                np.maximum(
-                    disocclusion.rim_strength(mask, self.masks),
-                    (disocclusion.inner_rim(mask) | (soft & mask)).astype(np.float32),
-                )
-                for mask in self.object_masks
+                np.maximum(outside, (disocclusion.inner_rim(mask) | (soft & mask)).astype(np.float32))
+                for outside, mask in zip(self._outskirts, self.object_masks, strict=True)
             ]
         )
         self._cores = self._cores & ~soft

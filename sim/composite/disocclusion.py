@@ -172,6 +172,26 @@ def push_pull(values: Linear, known: Mask) -> Linear:
     return np.where(known[..., None], values, cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR))
 
 
+BRIGHTER, DEEPEST = 1.1, 0.5
+"""Luminance of photo over clean plate above which it shows no shadow, and below which what is in no shadow's mask shows
+none either."""
+
+
+def remains(photo: Linear, background: Linear, masks: Sequence[Mask], shadow: Mask) -> list[NDArray[np.float32]]:
+    """Return per object where (H, W), 1 or 0, the photo shows a part of it that its mask lacks, such as fur or a stem.
+
+    There the clean plate differs from the photo by what is no ``shadow`` (H, W), and it must leave with the object.
+    """
+    together = np.logical_or.reduce(list(masks))
+    # A pixel of noise tells nothing; the offset is the noise of black.
+    over, under = (cv2.blur(np.ascontiguousarray(image.mean(axis=-1)), (3, 3)) + 0.005 for image in (photo, background))
+    unlike = (over > BRIGHTER * under) | ((over < DEEPEST * under) & ~shadow)
+    left = cv2.dilate((unlike & (photo != background).any(axis=-1)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    distances = [cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in masks]
+    nearest = np.argmin(np.stack(distances), axis=0)
+    return [(left & ~together & (nearest == index)).astype(np.float32) for index in range(len(masks))]
+
+
 def object_halos(photo: Linear, background: Linear, masks: Sequence[Mask], shadow: Mask) -> list[NDArray[np.float32]]:
     """Return per object the share (H, W), 0 to 1, of its surroundings that belongs to its appearance in the photo.
 
