@@ -22,7 +22,6 @@ from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.reconstruct import turntable
 from physgen.sim.reconstruct.turntable import Turned
 from physgen.sim.scene.folder import Scene
-from physgen.sim.scene.meshes import read_mesh
 from PIL import Image
 
 from .cases import Case
@@ -62,12 +61,7 @@ def true_body(case: Case) -> Turned:
 
 def found_body(folder: Scene, name: str) -> Turned:
     """The object ``name`` of a reconstructed scene."""
-    item = next(o for o in folder.model.objects if o.name == name)
-    mesh = read_mesh(folder.file(item.mesh))
-    mesh.apply_transform(np.asarray(item.world_from_mesh))
-    ground = folder.model.ground
-    up = np.array([0.0, 0.0, 1.0]) if ground is None else ground.unit_normal
-    return turntable.turned(mesh, folder.model.camera.position, up=up)
+    return turntable.turned_object(folder, next(item for item in folder.model.objects if item.name == name))
 
 
 def looks(body: Turned, azimuths: tuple[float, ...], extent: float | None, height: float | None) -> list[Look]:

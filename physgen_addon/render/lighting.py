@@ -120,8 +120,9 @@ def measure_reference_light(built: BlenderScene, folder: Path) -> None:
             # Its texture has its own colours, without a photo's light: they are what open white ground would make them.
             set_rest_light(target, np.full_like(target.mesh.vertices, ambient / AMBIENT + ambient), ambient)
             continue
-        # The texture of what the photo hides has colours, and with them the light, of what it shows.
-        set_rest_light(target, np.maximum(graph.continued(get_rest_light(target), visible), ambient), ambient)
+        # The texture of what the photo hides has the colours of what it shows, and of its light what its shading says.
+        even = graph.continued(get_rest_light(target) / target.shading, visible)
+        set_rest_light(target, np.maximum(even * target.shading, ambient), ambient)
 
 
 def _in_photo(built: BlenderScene, target: RenderObject) -> bool:

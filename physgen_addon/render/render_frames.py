@@ -39,7 +39,7 @@ from .motion_blur import Pose
 from .render_options import RenderOptions
 from .renderer import DataLayers, Renderer
 
-RENDER_REVISION = 18
+RENDER_REVISION = 19
 """Increased with every change of rendering that affects frames."""
 
 
@@ -141,7 +141,7 @@ def _scene_hash(folder: Scene, options: RenderOptions, blender: str) -> str:
     files = [scene.photo, scene.background, scene.light.environment]
     objects = []
     for item in scene.objects:
-        files += [item.mesh, item.mask, item.shadow]
+        files += [item.mesh, item.mask, item.shadow, item.shading]
         objects.append([item.name, to_json(item.world_from_mesh), item.size_m])
     content = {
         "revision": [RENDER_REVISION, VERSION, blender],

@@ -23,6 +23,7 @@ from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene, require_photo
 from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
 from ...sim.scene.model import Camera, Ground, SceneObject
+from ...sim.scene.shading import factors_at, read_shading
 from .. import compat
 from ..frames.frame_files import read_layers
 from ..paths import for_blender
@@ -48,15 +49,17 @@ UV = "photo"
 
 @dataclass(frozen=True)
 class RenderObject:
-    """One object. ``mesh`` holds the rest positions in world metres; ``item`` is its Blender object."""
+    """One object. ``mesh`` holds the rest positions in world metres; ``item`` is its Blender object; ``shading`` (V, 3)
+    how much brighter than evenly lit its texture is at the vertices."""
 
     source: SceneObject
     mesh: ObjectMesh
     item: bpy.types.Object
+    shading: NDArray[np.float64]
 
 
 def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObject) -> RenderObject:
-    """Load ``source`` and link it to ``collection``. Raises InputError if its mesh is unreadable."""
+    """Load ``source`` and link it to ``collection``. Raises InputError if its mesh or a picture is unreadable."""
     mesh = load_object_mesh(folder, source)
     uv, picture = _appearance(folder, source, mesh)
     data = bpy.data.meshes.new(source.name)
@@ -76,7 +79,9 @@ def add_object(collection: bpy.types.Collection, folder: Scene, source: SceneObj
         show_highlights(data, folder.model.camera, found, _load_image(f"{source.name} matt", matt))
     item = bpy.data.objects.new(source.name, data)
     collection.objects.link(item)
-    return RenderObject(source=source, mesh=mesh, item=item)
+    shading = read_shading(folder, source)
+    factors = np.ones_like(mesh.vertices) if shading is None else factors_at(shading, uv)
+    return RenderObject(source=source, mesh=mesh, item=item, shading=factors)
 
 
 def set_rest_light(target: RenderObject, values: NDArray[np.floating], ambient: float) -> None:

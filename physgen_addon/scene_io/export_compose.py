@@ -129,6 +129,9 @@ def _from_photo(photo: Scene, item: bpy.types.Object, made: SceneObject, mesh: T
     if source.mask is not None:
         _copy(photo.file(source.mask), inside(root, f"masks/{made.name}.png"))
         made = dataclasses.replace(made, mask=f"masks/{made.name}.png")
+    if source.shading is not None:
+        _copy(photo.file(source.shading), inside(root, f"shading/{made.name}.png"))
+        made = dataclasses.replace(made, shading=f"shading/{made.name}.png")
     return dataclasses.replace(made, mesh=name, occlusion_order=source.occlusion_order)
 
 

@@ -32,7 +32,8 @@ from ..mpm.surface_contact import SurfaceContact
 from ..rigid_alignment import nearest_pose
 from ..scene.folder import SCENE_FILE, Scene, unchanged_scene
 from ..scene.scene_object import SceneObject
-from ..scene.textured_mesh import TexturedMesh, read_textured_mesh
+from ..scene.shading import evenly_lit_mesh
+from ..scene.textured_mesh import TexturedMesh
 from .export_patch import prim_name
 from .scene_to_world import surface
 from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
@@ -76,8 +77,8 @@ def export_usd(
 ) -> tuple[str, ...]:
     """Write ``scene``, with the motion of ``bake``, to ``file`` (``.usda`` or ``.usdc``); return what USD lacks.
 
-    Textures go into ``STEM_textures`` beside it. What moves as a rigid body has a pose a frame, everything else its
-    points; time code n is frame n.
+    Textures go into ``STEM_textures`` beside it, evenly lit where the scene says what light is in them. What moves as a
+    rigid body has a pose a frame, everything else its points; time code n is frame n.
 
     >>> import physgen
     >>> physgen.export_usd(physgen.load_scene("scene"), "scene.usdc", bake=physgen.load_bake("bake"))  # doctest: +SKIP
@@ -241,7 +242,7 @@ class _Writer:
     def _object(self, index: int, item: SceneObject, baked: BakedObject | None) -> None:
         from pxr import Gf, UsdGeom, UsdPhysics
 
-        mesh = read_textured_mesh(self.scene.file(item.mesh))
+        mesh = evenly_lit_mesh(self.scene, item)
         matrix = np.asarray(item.world_from_mesh, dtype=np.float64)
         world = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         faces = mesh.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else mesh.faces

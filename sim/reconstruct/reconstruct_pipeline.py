@@ -92,7 +92,7 @@ def write_scene(
     """
     names = [item.name or "" for item in objects]
     layers = found.layers
-    for sub in ("masks", "shadows", "holes", "meshes", "albedo"):
+    for sub in ("masks", "shadows", "holes", "meshes", "albedo", "shading"):
         (folder / sub).mkdir()
     save_png(folder / "photo.png", found.pixels)
     save_png(folder / "background.png", layers.background)
@@ -103,11 +103,11 @@ def write_scene(
         if (layers.full[i] != layers.seen[i]).any():
             (folder / "full").mkdir(exist_ok=True)
             save_png(folder / "full" / f"{name}.png", layers.full[i].astype(np.uint8) * 255)
-        look = found.looks[i]
+        surface, look = found.bodies[i].surface, found.looks[i]
+        if surface.shading is not None:
+            save_png(folder / "shading" / f"{name}.png", surface.shading)
         save_png(folder / "albedo" / f"{name}.png", look.albedo)
-        content = glb_bytes(
-            found.bodies[i].surface, bases[i], found.metres, roughness=look.roughness, metallic=look.metallic
-        )
+        content = glb_bytes(surface, bases[i], found.metres, roughness=look.roughness, metallic=look.metallic)
         (folder / "meshes" / f"{name}.glb").write_bytes(content)
     origin = bases[0] * (1.0, 1.0, 0.0)
     return SceneModel(
@@ -127,6 +127,7 @@ def write_scene(
                 occlusion_order=layers.front_to_back.index(i),
                 mask=f"masks/{name}.png",
                 shadow=f"shadows/{name}.png",
+                shading=None if found.bodies[i].surface.shading is None else f"shading/{name}.png",
             )
             for i, name in enumerate(names)
         ),

@@ -18,13 +18,12 @@ from ..errors import InputError
 from ..html import page_head, page_style, prose, render
 from ..scene.environment import read_environment
 from ..scene.folder import Scene
-from ..scene.meshes import read_mesh
 from ..scene.model import SceneObject
 from ..version import VERSION
 from . import report_pictures
 from .lighting.light_estimate import describe_sun
 from .photo_layers import Layers
-from .turntable import sheet, turned
+from .turntable import sheet, turned_object
 
 REPORT_FILE = "report.html"
 WIDTH = 900
@@ -187,16 +186,12 @@ def _camera(folder: Scene, data: ReportData) -> Section:
 
 def _shapes(folder: Scene, data: ReportData) -> Section:
     figures = []
-    ground = folder.model.ground
-    up = np.array([0.0, 0.0, 1.0]) if ground is None else ground.unit_normal
-    viewer = folder.model.camera.position
     for item, shape in zip(folder.model.objects, data.shapes, strict=True):
-        mesh = read_mesh(folder.file(item.mesh))
-        mesh.apply_transform(np.asarray(item.world_from_mesh))
-        extent = np.ptp(np.asarray(mesh.vertices), axis=0) * 100
+        body = turned_object(folder, item)
+        extent = np.ptp(body.vertices, axis=0) * 100
         size = " × ".join(f"{value:.3g}" for value in extent)
-        text = f"{item.name}: {shape}, {size} cm, {len(mesh.vertices)} vertices"
-        figures.append(_figure(sheet(turned(mesh, viewer, up=up)), f"{text}.", TURNTABLE_WIDTH))
+        text = f"{item.name}: {shape}, {size} cm, {len(body.vertices)} vertices"
+        figures.append(_figure(sheet(body), f"{text}.", TURNTABLE_WIDTH))
     return Section(
         title="Shape and texture",
         text="Each body from eight sides, without light: at 0° as photographed, then around it to the right; the dark "

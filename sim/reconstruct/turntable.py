@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""A body from all sides: views from a circle around it, on neutral ground, in its own colours without any light."""
+"""A body from all sides: views from a circle around it, on neutral ground, in its own colours, evenly lit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from ..scene.folder import Scene
+from ..scene.meshes import read_mesh
+from ..scene.scene_object import SceneObject
+from ..scene.shading import evenly_lit, read_shading
 from .mesh_raster import Paint, colours, paint_of, rasterise
 
 Pixels = NDArray[np.uint8]
@@ -97,6 +101,23 @@ def turned(
         centre=centre,
         radius=max(float(np.linalg.norm(used - centre, axis=1).max()), 1e-9),
     )
+
+
+def turned_object(folder: Scene, item: SceneObject) -> Turned:
+    """Return the object ``item`` of a scene, to be viewed from its camera's side, without the light of its photo as far
+    as that is known.
+
+    Raises InputError for a mesh or shading that cannot be read.
+    """
+    mesh = read_mesh(folder.file(item.mesh))
+    mesh.apply_transform(np.asarray(item.world_from_mesh))
+    ground = folder.model.ground
+    body = turned(mesh, folder.model.camera.position, up=UP if ground is None else ground.unit_normal)
+    shading, texture = read_shading(folder, item), body.paint.texture
+    if shading is None or texture is None:
+        return body
+    even = evenly_lit(texture, shading, f"{item.name}: {item.shading}")
+    return replace(body, paint=replace(body.paint, texture=even))
 
 
 def view(body: Turned, azimuth: float, *, side: int = SIDE, rise: float = RISE_DEG, ground: bool = True) -> View:

@@ -79,7 +79,7 @@ class Scene:
         objects = []
         for item in scene.objects:
             fields: dict[str, Any] = to_json(item)
-            for irrelevant in ("mask", "shadow", "occlusion_order", "size_m"):
+            for irrelevant in ("mask", "shadow", "shading", "occlusion_order", "size_m"):
                 del fields[irrelevant]
             fields["material"].pop("preset")
             for later in ("asleep", "held", "material_tracks", "stiffness_map", "density_map"):
@@ -287,7 +287,8 @@ def referenced_files(scene: SceneModel) -> list[str]:
     names = [name for name in (scene.photo, scene.background) if name is not None]
     for item in scene.objects:
         track = item.motion.vertices_file if item.motion else None
-        names += [name for name in (item.mesh, item.mask, item.shadow, track, item.splats) if name is not None]
+        seen = (item.mesh, item.mask, item.shadow, track, item.splats, item.shading)
+        names += [name for name in seen if name is not None]
         factors = [factors.file for factors in (item.stiffness_map, item.density_map) if factors is not None]
         names += [name for name in factors if name is not None]
     names += [name for name in (scene.light.environment, scene.depth) if name is not None]

@@ -230,6 +230,7 @@ class SceneObject:
     motion: of a collider; None for a static one.
     splats: PLY file of Gaussian splats in the mesh file's coordinates, relative to the scene folder, or None. They are
         what is rendered; the mesh is filled with particles and collides, and the splats follow the particles.
+    shading: picture (``shading.py``) of the photo's light on the mesh's texture, relative to the scene folder, or None.
 
     Of dynamic objects only:
     asleep: whether the object keeps the pose it has at the start until something touches it, if it stands and nothing
@@ -267,6 +268,7 @@ class SceneObject:
     contact_mode: str | None = None
     motion: Motion | None = None
     splats: str | None = None
+    shading: str | None = None
     asleep: bool = False
     held: bool = False
     start_time: float = quantity(0.0, 0.0, 1e6, "seconds")

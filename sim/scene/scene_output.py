@@ -110,6 +110,7 @@ OWN_ENTRIES = frozenset(
         "meshes",
         "splats",
         "albedo",
+        "shading",
         COMPOSE_FILE,
         SUMS_FILE,
         "light",

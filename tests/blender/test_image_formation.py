@@ -14,6 +14,7 @@ from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_ma
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Light
+from physgen.sim.scene.shading import NEUTRAL, shading_values
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")
@@ -143,3 +144,54 @@ def test_a_highlight_stays_where_its_lamp_is_while_the_ball_turns(world, bake, t
     went = camera.project(((spot - centre) @ turn.T + centre)[None])[0, :2]
     assert inside[int(went[1]), int(went[0])] and np.hypot(*(went - place)) > 10
     assert now[int(went[1]), int(went[0]), 2] < 0.5 * blue.max()
+
+
+def with_an_even_back(folder, photo, *, shading):
+    """Let the ball show the photo where that shows it, and behind the colour of its middle; return the scene.
+
+    Its own colour is even, so the photo's light over that of its middle is its shading.
+    """
+    item, camera = folder.model.objects[0], folder.model.camera
+    mesh: Any = trimesh.load(folder.file(item.mesh), process=False, force="mesh")
+    height, width = photo.shape[:2]
+    at = camera.project(mesh.vertices)
+    towards = ((camera.position - mesh.vertices) * mesh.vertex_normals).sum(axis=1) > 0
+    front = towards[mesh.faces].all(axis=1)
+    own = np.stack([at[:, 0] / (2 * width), 1 - at[:, 1] / height], axis=1)
+    uv = np.concatenate([own, np.full_like(own, (0.75, 0.5))])
+    faces = np.where(front[:, None], mesh.faces, mesh.faces + len(own))
+    texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+    light = bytes_to_linear(texture)
+    x, y = camera.project(mesh.vertices.mean(axis=0)[None])[0, :2].astype(int)
+    middle = light[y - 3 : y + 4, x - 3 : x + 4].mean(axis=(0, 1))
+    back = np.broadcast_to(linear_to_bytes(middle.astype(np.float32)), texture.shape)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(np.hstack([texture, back])))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    twice = np.concatenate([mesh.vertices, mesh.vertices])
+    trimesh.Trimesh(twice, faces, visual=visual, process=False).export(folder.file(item.mesh))
+    if not shading:
+        return folder
+    factors = shading_values(np.log(np.maximum(light, 1e-3) / middle))
+    Image.fromarray(np.hstack([factors, np.full_like(factors, NEUTRAL)])).save(folder.root / "shading.png")
+    shaded = dataclasses.replace(item, shading="shading.png")
+    return folder.with_model(dataclasses.replace(folder.model, objects=(shaded,)))
+
+
+def test_a_ball_of_one_colour_that_turns_its_back_looks_as_before(world, bake, tmp_path):
+    """The light at rest goes on behind without the shade of the photo's dark side, as the even texture there does."""
+    inside = ndimage.binary_erosion(read_mask(world.folder.file("masks/ball.png")), iterations=3)
+    found = {}
+    for shading in (False, True):
+        shutil.copytree(world.folder.root, tmp_path / str(shading))
+        folder = with_an_even_back(load_scene(tmp_path / str(shading)), world.photo, shading=shading)
+        rest = load_object_mesh(folder, folder.model.objects[0]).vertices
+        centre = (rest.max(axis=0) + rest.min(axis=0)) / 2
+        poses = [(rest - centre) * (turn, turn, 1.0) + centre - rest for turn in (1.0, -1.0)]
+        opened = open_bake(load_bake(bake(poses, f"bake {shading}", rest)), folder)
+        renderer = Renderer(folder, opened, RenderOptions(samples=16, grain=False, motion_blur=0))
+        still, turned = (linear_to_bytes(renderer.frame(sample).beauty) for sample in (0, 1))
+        renderer.close()
+        assert psnr(still, world.photo, inside) > 35
+        found[shading] = psnr(turned, world.photo, inside)
+    # As close as the ball that only moves.
+    assert found[True] > 30 > found[False] + 3, found

@@ -22,6 +22,7 @@ from physgen.sim.scene.camera_path import load_camera_path, save_camera_path, sw
 from physgen.sim.scene.folder import load_scene, save_scene, side_files
 from physgen.sim.scene.meshes import load_vertex_track, read_mesh
 from physgen.sim.scene.overrides import apply_overrides
+from physgen.sim.scene.shading import evenly_lit_mesh, factors_at, read_shading
 from physgen.sim.scene.textured_mesh import read_textured_mesh, write_moved_mesh
 from PIL import Image
 
@@ -120,6 +121,19 @@ def _read_glb(folder: Path) -> None:
     Texture.of(read_textured_mesh(folder / "box.glb"))
 
 
+def _shading(folder: Path) -> None:
+    put_scene(folder)
+    _glb(folder)
+    put_picture(folder / "shading.png", PIXELS[:8, :8])
+
+
+def _read_shading(folder: Path) -> None:
+    scene = load_scene(folder)
+    item = dataclasses.replace(scene.objects[0], mesh="box.glb", shading="shading.png")
+    evenly_lit_mesh(scene, item)
+    factors_at(read_shading(scene, item), RANDOM.random((5, 2)))
+
+
 def _gltf(folder: Path) -> None:
     for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene(BOX)).items():
         (folder / ("box.gltf" if name.endswith(".gltf") else name)).write_bytes(content)
@@ -208,6 +222,7 @@ def _read_splat_object(folder: Path) -> None:
 add("model of MuJoCo", ("m.xml", "box.stl"), _mjcf, lambda f: import_folder(f / "m.xml", out=f / "scene"))
 add("model in URDF", ("m.urdf", "box.stl"), _urdf, lambda f: import_folder(f / "m.urdf", out=f / "scene"))
 add("mesh GLB", "box.glb", _glb, _read_glb)
+add("shading of a texture", "shading.png", _shading, _read_shading)
 add("mesh GLB through trimesh", "box.glb", lambda f: BOX.export(f / "box.glb"), lambda f: read_mesh(f / "box.glb"))
 add("mesh glTF", "box.gltf", _gltf, _read_gltf)
 add("mesh OBJ", ("box.obj", "box.mtl", "box.png"), _obj, _read_obj)

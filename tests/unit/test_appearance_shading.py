@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.reconstruct.appearance.albedo import split_creases
 from physgen.sim.reconstruct.appearance.object_shading import (
     LocalLighting,
     Occluders,
@@ -19,6 +18,7 @@ from physgen.sim.reconstruct.appearance.object_shading import (
     sun_lobe,
 )
 from physgen.sim.reconstruct.camera import ground_camera as cameras
+from physgen.sim.reconstruct.creases import split_creases
 from physgen.sim.reconstruct.lighting.ground_lighting import surface_points
 from physgen.sim.reconstruct.mesh_raster import seen_faces, visible_pixels
 from physgen.sim.scene.equirectangular import directions

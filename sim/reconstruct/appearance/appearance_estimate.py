@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from ...composite.srgb import bytes_to_linear
 from ...scene.equirectangular import Radiance
 from ...scene.model import Camera, Light
+from ..creases import CreasedSurface, split_creases
 from ..mesh_raster import seen_faces, visible_pixels
 from ..photo_layers import Layers
 from ..reasoning.material_decision import ObjectPhysics
@@ -23,7 +24,7 @@ from ..shape.body_texture import TexturedSurface
 from ..shape.object_bodies import Body
 from ..shape.object_placement import TriangleMesh
 from ..stage_cache import Arrays, Notice, StageCache, Steps
-from .albedo import NEAR, CreasedSurface, compute_albedo, split_creases, texel_values
+from .albedo import NEAR, compute_albedo, texel_values
 from .object_shading import DIELECTRIC_F0, LocalLighting, Mesh, Shading, local_lighting, shade, sky_lobe, sun_lobe
 from .reflectance_fit import FitPixels, Reflectance, fit_reflectance
 

@@ -12,6 +12,7 @@ surface_mesh.py        marching cubes at a wanted number of vertices
 stability.py           how safely a body stands, and a broader base
 object_placement.py    supports, what hangs, and bodies apart
 body_texture.py        pixels of the photo on a body; even_light.py without their light
-texture_atlas.py       texture for all sides; surface_charts.py its layout, plain_matter.py what no pixel shows,
-                       stripes.py what goes round, hidden_seams.py no seams in it
+texture_atlas.py       texture for all sides; surface_charts.py its layout, surface_values.py what it depends on,
+                       plain_matter.py what no pixel shows, stripes.py what goes round, hidden_seams.py no seams in it,
+                       texture_shading.py the photo's light in it
 """

@@ -305,13 +305,15 @@ class CropTexture:
 @dataclass(frozen=True)
 class TexturedSurface:
     """vertices: (V, 3); faces: (T, 3); uv: (V, 2), origin at the bottom left, into picture: (h, w, 3) uint8 sRGB.
-    alpha: (h, w) uint8, how much of a texel the object covers where the photo shows its outline; None: all of each."""
+    alpha: (h, w) uint8, how much of a texel the object covers where the photo shows its outline; None: all of each.
+    shading: (h, w, 3) uint8 the photo's light in it (`shading.py`), None where that is not known."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     uv: NDArray[np.float64]
     picture: NDArray[np.uint8]
     alpha: NDArray[np.uint8] | None = None
+    shading: NDArray[np.uint8] | None = None
 
 
 def textured(body: BodyMesh, texture: CropTexture) -> TexturedSurface:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The photo's light on a body, as far as it follows the body's shape.
 
-Sides that nothing shows get the colours of the visible side without its bright and dark half.
+Sides that nothing shows get the colours of the visible side without its bright and dark half, and the texture's
+shading says how much of what the photo shows is light.
 
 A matt convex surface in distant light is as bright as a quadratic polynomial of its normal (Basri & Jacobs, Lambertian
 Reflectance and Linear Subspaces, PAMI 25(2), 2003). It is fitted to the logarithms of the pixels of the most common
@@ -9,6 +10,8 @@ chromaticity, robustly, so that marks and paint have no part in it.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,6 +28,7 @@ from .inflated_mesh import BodyMesh
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 Picture = NDArray[np.float32]
 
 COARSE = 128
@@ -49,21 +53,54 @@ MOST = 1.5
 """Largest logarithm of the light over its mean."""
 
 
-def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -> Picture:
-    """Return the logarithm (h, w, 3) of the light in ``texture`` that follows the normals of ``body``.
+TRUST_REACH = (0.25, 0.06)
+"""Standard deviations, over the longer side of the picture, of the surroundings in which pixels tell whether they are
+lit as fitted: wide ones, and near ones that are held against the wide."""
+TRUST_HELD = 0.02
+"""Square of the logarithm of light, near, that counts as much as what the wide surroundings tell."""
 
-    Its mean is 0 with the squared cosine of the angle to the camera as weight. mask: (h, w) the object in the texture.
-    Zero where the photo does not tell.
+
+@dataclass(frozen=True, eq=False)
+class LightByNormal:
+    """coefficients: (8, 3) of the polynomial of the normal. usual: (3,) its value where the light counts as 1. share:
+    of it to believe. fitted: the normals that it was fitted to."""
+
+    coefficients: Points
+    usual: Points
+    share: float
+    fitted: cKDTree
+
+    def on(self, normals: Points) -> Points:
+        """Return the logarithm (n, 3) of the light on surfaces with unit ``normals`` (n, 3)."""
+        light = np.clip(_basis(normals) @ self.coefficients - self.usual, -MOST, MOST) * self.share
+        away = self.fitted.query(normals, distance_upper_bound=UNLIKE[1])[0]
+        return np.asarray(light * smoothstep(np.minimum(away, UNLIKE[1]), UNLIKE[1], UNLIKE[0])[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class BodyLight:
+    """The photo's light on a body: by its normal, picture: (h, w, 3) its logarithm at the pixels of the texture, trust:
+    (h, w) how far the pixels around bear it out, 0 to 1."""
+
+    by_normal: LightByNormal
+    picture: Picture
+    trust: Picture
+
+
+def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -> BodyLight | None:
+    """Return the light in ``texture`` that follows the normals of ``body``; None where the photo does not tell.
+
+    Its mean logarithm is 0 with the squared cosine of the angle to the camera as weight. mask: (h, w) the object in the
+    texture.
     """
     height, width = mask.shape
-    none = np.zeros((height, width, 3), dtype=np.float32)
     scale = min(1.0, COARSE / max(height, width))
     size = (max(4, round(width * scale)), max(4, round(height * scale)))
     at = camera.project(body.vertices)
     at[:, :2] = (at[:, :2] - (texture.left, texture.top)) * (size[0] / width, size[1] / height)
     shown = rasterise(at, body.faces, size)
     if len(shown.rows) < LEAST[0]:
-        return none
+        return None
     a, b, c = (body.vertices[body.faces[shown.faces, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -78,21 +115,42 @@ def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -
     logs = np.log(np.maximum(colour, 1e-4))
     common = np.flatnonzero(good)[_most_common(logs[good])]
     if len(common) < max(LEAST[0], LEAST[1] * float((cosine > FACING).sum())):
-        return none
-    basis = _basis(normal)
-    found, share = _fitted(basis[common], logs[common])
+        return None
+    basis = _basis(normal[common])
+    found, share = _fitted(basis, logs[common])
     # What faces the camera sets the level: a back is held against that, not against a dark flank or a bright top.
-    usual = np.average(basis[common] @ found, axis=0, weights=cosine[common] ** 2)
-    light = np.clip(basis @ found - usual, -MOST, MOST) * share
-    away = cKDTree(normal[common]).query(normal, distance_upper_bound=UNLIKE[1])[0]
-    light *= smoothstep(np.minimum(away, UNLIKE[1]), UNLIKE[1], UNLIKE[0])[:, None]
+    usual = np.average(basis @ found, axis=0, weights=cosine[common] ** 2)
+    by_normal = LightByNormal(found, usual, share, cKDTree(normal[common]))
+    light = by_normal.on(normal)
+    seen, explained = logs[common].mean(axis=1), light[common].mean(axis=1)
+    seen -= float(np.median(seen - explained))
+    trust = _trust((shown.rows[common], shown.columns[common]), seen, explained, size)
     grid = np.zeros((size[1], size[0], 3), dtype=np.float32)
-    known = shown.on_grid(size)
     grid[shown.rows, shown.columns] = light
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return np.asarray(
-        cv2.resize(grid[tuple(nearest)], (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32
-    )
+    nearest = ndimage.distance_transform_edt(~shown.on_grid(size), return_distances=False, return_indices=True)
+    return BodyLight(by_normal, *(_enlarged(values, width, height) for values in (grid[tuple(nearest)], trust)))
+
+
+def _enlarged(values: Picture, width: int, height: int) -> Picture:
+    return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _trust(at: tuple[Indices, Indices], seen: Points, light: Points, size: tuple[int, int]) -> Picture:
+    """How far (h, w), 0 to 1, the logarithms ``seen`` (n,) at rows and columns ``at`` rise with the ``light`` (n,).
+
+    That is the slope of the one over the other around each pixel, by least squares through the origin.
+    """
+    both = np.zeros((size[1], size[0], 2), dtype=np.float32)
+    both[at] = np.column_stack([seen * light, light * light])
+    count = np.zeros(both.shape[:2], dtype=np.float32)
+    count[at] = 1.0
+    slope = np.ones(both.shape[:2], dtype=np.float32)
+    for reach in TRUST_REACH:
+        sigma = reach * max(size)
+        near = cv2.GaussianBlur(both, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        held = TRUST_HELD * cv2.GaussianBlur(count, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        slope = np.clip((near[..., 0] + held * slope) / np.maximum(near[..., 1] + held, 1e-9), 0.0, 1.0)
+    return np.asarray(slope, dtype=np.float32)
 
 
 def _basis(normal: Points) -> Points:

@@ -310,7 +310,8 @@ def make_bodies(
             made = store.run(
                 "fit", {**inputs, **given, "file": file}, partial(_fitted, own, full, seen, colours, item, mesher)
             )
-        surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"], made.get("alpha"))
+        soft, shading = made.get("alpha"), made.get("shading")
+        surface = TexturedSurface(made["vertices"], made["faces"], made["uv"], made["picture"], soft, shading)
         bodies.append(Body(surface, str(made["shape"]), turned))
     bodies = _on_supports(view, layers.seen, bodies, objects, steps.notice)
     return _separated(view, layers.front_to_back, bodies, objects, steps.notice)
@@ -331,6 +332,7 @@ def _arrays(surface: TexturedSurface, shape: str) -> Arrays:
         "picture": surface.picture,
         "shape": np.array(shape),
         **({} if surface.alpha is None else {"alpha": surface.alpha}),
+        **({} if surface.shading is None else {"shading": surface.shading}),
     }
 
 
