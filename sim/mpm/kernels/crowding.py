@@ -83,6 +83,11 @@ LEAST_ROOM = 0.05
 NOTHING = 1e3
 """Crowding of nodes that are no measure."""
 
+BESIDE = 0.03
+"""Largest crowding of a node beside ground or bodies. Their surfaces count as faces, which at a convex edge leaves as
+little as half of the room that there is: ln of that is some twenty times the crowding of a pond, and lifted what
+floats."""
+
 PUSHED = 6
 """Place in a row of ``FlowArrays.pushes`` that says whether the body takes room in the block."""
 
@@ -186,6 +191,7 @@ def find_crowding(
                                     filled = -(2.0 * LOOSE + filled)
                                 crowding = filled + flow.velocity[first + i][3]
                                 if room < 1.0:
+                                    crowding = ti.min(crowding, BESIDE)
                                     strength = dt * STIFFNESS * modulus * crowding * room
                                     push_apart(g, i, w, strength, worlds, grid, nodes, flow, bodies, shapes, coupling)
                         flow.crowding[first + i] = crowding

@@ -86,6 +86,16 @@ LEVELLED = 0.02
 cancel on the nodes, so that they cause no force, vanish within some 50 substeps."""
 
 
+@ti.func
+def moment_at_surface(a: vec3, radius: ti.f32):
+    """First moment about a particle (cells²/s²) of its contact acceleration ``a`` (cells/s²), which acts not at the
+    particle but at its body's surface, ``radius`` cells away. It lies along ``a``, so it has no torque.
+
+    A fluid's layer next to a surface bears the pressure on its whole depth. Pushed at its particles, it would be
+    squeezed on the inner half alone, hence have half the pressure, along the surface as well: no rest."""
+    return (-radius / ti.max(a.norm(), 1e-9)) * a.outer_product(a)
+
+
 @func
 def anchor_place(f: ti.i32, time: ti.f32, place: vec4, worlds: WorldArrays):
     """Where the anchor at rest at ``place`` is ``time`` s into the segment (cells), and its velocity."""
@@ -336,6 +346,9 @@ def advance_block(
                 # Start the contact solve from the forces of the last substep.
                 a = particles.reaction[p]
                 vp += dt_scatter * vec3(a[0], a[1], a[2])
+                if ti.static(len(laws.volumetric) > 0):
+                    if is_fluid(law):
+                        Q += (4.0 * dt_scatter * mass) * moment_at_surface(vec3(a[0], a[1], a[2]), fixed[3])
             q = mass * vp - Q @ fx
             b4 = vec4(q[0], q[1], q[2], mass)
             c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
