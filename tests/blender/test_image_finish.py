@@ -49,6 +49,7 @@ def test_everything_on_changes_nothing_at_rest_and_each_changes_what_moves(world
     assert not bpy.data.scenes.get("PhysGen colours") and not bpy.data.cameras
 
 
+@pytest.mark.long
 def test_motion_blur_is_the_mean_over_the_shutter(world, bake):
     way = np.array([0.06, 0.0, 0.03])
     fine = [(0, 0, 0), *(0.5 * way + way * 0.5 * (i + 0.5) / 12 for i in range(12))]

@@ -109,6 +109,7 @@ def test_each_correction_repeats_what_depends_on_it_and_nothing_else(scene, tmp_
     assert changed(scene, before) >= {"mesh", "shadows", "background"} and "segment" not in changed(scene, before)
 
 
+@pytest.mark.long
 def test_matter_motion_and_light_that_were_changed_since_stay(scene):
     set_physics(load_scene(scene), Physics(presets=("hard", "soft"), velocities=((1.0, 0.0, 2.0),)))
     set_light(load_scene(scene), request=LightRequest(sun_direction=(0.0, 0.3, 1.0), sun_strength=2.0))

@@ -68,6 +68,7 @@ def photo(surface, gloss, *, view=VIEW, shadow=0.0, seed=0, colour=(150, 95, 60)
     return linear_to_bytes(light), mask, linear_to_bytes(ground)
 
 
+@pytest.mark.long
 @settings(max_examples=5, deadline=None, phases=(Phase.explicit, Phase.generate))
 @given(
     reflectivity=st.floats(0.04, 0.3),

@@ -77,6 +77,7 @@ def test_a_membrane_over_a_large_picture_is_that_of_the_small_one():
     assert np.abs(found - slope)[free].max() < 0.02
 
 
+@pytest.mark.long
 def test_ground_in_shadow_keeps_its_grain():
     photo, truth, hole, thing = shaded_table()
     given, left = relit(photo, hole, np.zeros_like(hole), thing)

@@ -77,6 +77,7 @@ def test_a_belt_takes_a_soft_box_along(box, options, similarity):
     assert abs(world.velocities(0)[:, 1].mean()) < 0.01 * SPEED
 
 
+@pytest.mark.long
 def test_a_turntable_of_vertices_turns_what_lies_on_it(box_body, rigid_bodies):
     """With mu g above w² r it goes round with the disc: the disc's own spin within 2 %, on its circle within 2 %."""
     spin, seconds, keys, radius = 2.0, 0.4, 5, 0.2

@@ -128,7 +128,7 @@ def series(stiff: float) -> float:
     return load * ((LENGTH**2 - half**2) / 2 + half**2 / 2 / stiff)
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb"])
+@pytest.mark.parametrize("suffix", ["ply", pytest.param("glb", marks=pytest.mark.long)])
 def test_a_bar_painted_in_two_stiffnesses_stretches_as_springs_in_series(hang, suffix):
     """Lower half a fourth as stiff: within 5 %, relative to the same bar unpainted, whose own error is that of the
     pins' half layer (``test_mpm_statics``)."""
@@ -138,6 +138,7 @@ def test_a_bar_painted_in_two_stiffnesses_stretches_as_springs_in_series(hang, s
     assert painted / plain == pytest.approx(series(0.25) / series(1.0), rel=0.05)
 
 
+@pytest.mark.long
 def test_weights_in_an_npz_are_the_same_as_in_the_mesh(hang, tmp_path):
     weights = lower_half(bar_mesh().vertices[:, 2])
     np.savez(tmp_path / "weights.npz", weights=weights)
