@@ -5,6 +5,7 @@ import math
 
 import cv2
 import numpy as np
+import pytest
 from physgen.sim.reconstruct.background.background_inpainting import blend, fill_background
 from physgen.sim.reconstruct.background.relit_ground import continued, membrane, relit
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
