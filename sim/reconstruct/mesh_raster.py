@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from ..scene.model import Camera
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Points = NDArray[np.float64]
+Number = TypeVar("Number", bound=np.generic)
 
 CHUNK = 200_000
 """Pairs of triangle and pixel that are tested at a time."""
@@ -110,6 +112,19 @@ class VisiblePixels:
         covered = np.zeros(size[::-1], dtype=bool)
         covered[self.rows, self.columns] = True
         return covered
+
+    def spread(self, values: NDArray[Number], size: tuple[int, int]) -> NDArray[Number]:
+        """Return ``values`` (P, C) on the grid (height, width, C) of ``size`` (width, height), the nearest ones where
+        nothing is seen; zero everywhere if nothing is."""
+        # Not all that rasterises needs SciPy.
+        from scipy import ndimage
+
+        result = np.zeros((size[1], size[0], values.shape[1]), dtype=values.dtype)
+        if not len(self.rows):
+            return result
+        result[self.rows, self.columns] = values
+        nearest = ndimage.distance_transform_edt(~self.on_grid(size), return_distances=False, return_indices=True)
+        return np.asarray(result[tuple(nearest)])
 
 
 def rasterise(at: Points, faces: Ints, size: tuple[int, int], use: NDArray[np.bool_] | None = None) -> VisiblePixels:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a mask lacks of its object is told from the object's shadow by the clean plate."""
+"""Parts of an object that its mask lacks are distinguished from its shadow by the clean plate."""
 
 import cv2
 import numpy as np

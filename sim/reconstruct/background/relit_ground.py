@@ -33,8 +33,8 @@ MARGIN = 0.6
 FINE, COARSE = 0.0125, 0.2
 """Blurs over the hole's size: of the level along its border, and beyond which a colour is the surface's own."""
 DETAIL = 0.003
-"""Penalty on steps of the lack of light in logarithms times cells, over the hole's size in cells. A shadow of a tenth
-less light is told from the pattern if it is wider than an eighth of the hole."""
+"""Penalty on steps of the lack of light in logarithms times cells, over the hole's size in cells. A shadow that takes
+a tenth of the light is kept apart from the pattern if it is wider than an eighth of the hole."""
 HELD = 5.0
 """Weight of the known ground, which lacks nothing, over that of a cell of the hole."""
 SUDDEN = 0.06

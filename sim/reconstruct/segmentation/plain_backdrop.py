@@ -80,7 +80,8 @@ COLOURED = 10.0
 
 def plain_backdrop(pixels: Pixels) -> Mask | None:
     """Return the backdrop (h, w) of ``pixels`` (H, W, 3) on a copy of at most ``SIDE``; None where it is not plain."""
-    steps = edge_strength(cielab(_copy(pixels), blur=0.8))
+    small = _copy(pixels)
+    steps = edge_strength(cielab(small, blur=0.8))
     calm = (steps < CALM).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * PASS + 1, 2 * PASS + 1))
     _, labels = cv2.connectedComponents(cv2.erode(calm, disc), connectivity=4)
@@ -90,7 +91,7 @@ def plain_backdrop(pixels: Pixels) -> Mask | None:
     areas = cv2.connectedComponentsWithStats((~result).astype(np.uint8), connectivity=8)[2][1:, cv2.CC_STAT_AREA]
     specks = areas[areas < SPECK * areas.max(initial=0)].sum()
     plain = (
-        (result[rim].mean() > BORDER or _page(pixels, result))
+        (result[rim].mean() > BORDER or _page(small, result))
         and np.median(steps[result]) < EVEN
         and specks < SPECKS * result.sum()
     )
@@ -98,8 +99,8 @@ def plain_backdrop(pixels: Pixels) -> Mask | None:
 
 
 def _page(pixels: Pixels, backdrop: Mask) -> bool:
-    """Whether ``backdrop`` (h, w) is a white page that reaches all sides of the photo ``pixels`` (H, W, 3)."""
-    white = backdrop & (_copy(pixels).min(axis=-1) >= WHITE)
+    """Whether ``backdrop`` (h, w) is a white page that reaches all sides of the copy ``pixels`` (h, w, 3)."""
+    white = backdrop & (pixels.min(axis=-1) >= WHITE)
     sides = [white[0], white[-1], white[:, 0], white[:, -1]]
     whole = np.concatenate(sides).mean() > PAGE_BORDER and min(side.mean() for side in sides) > PAGE_SIDE
     return bool(whole and white.sum() > PAGE * backdrop.sum())

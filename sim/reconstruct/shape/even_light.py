@@ -125,10 +125,8 @@ def light_on(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Mask) -
     seen, explained = logs[common].mean(axis=1), light[common].mean(axis=1)
     seen -= float(np.median(seen - explained))
     trust = _trust((shown.rows[common], shown.columns[common]), seen, explained, size)
-    grid = np.zeros((size[1], size[0], 3), dtype=np.float32)
-    grid[shown.rows, shown.columns] = light
-    nearest = ndimage.distance_transform_edt(~shown.on_grid(size), return_distances=False, return_indices=True)
-    return BodyLight(by_normal, *(_enlarged(values, width, height) for values in (grid[tuple(nearest)], trust)))
+    grid = shown.spread(light.astype(np.float32), size)
+    return BodyLight(by_normal, *(_enlarged(values, width, height) for values in (grid, trust)))
 
 
 def _enlarged(values: Picture, width: int, height: int) -> Picture:

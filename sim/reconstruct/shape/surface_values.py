@@ -65,14 +65,6 @@ WIDTHS = (3, 3, 2, 2, 1, 1, 1, 3, 1)
 """Columns of each of the ``SurfaceValues``."""
 
 
-def face_normals(vertices: Points, faces: NDArray[np.int64]) -> tuple[Points, NDArray[np.float64]]:
-    """Return unit normals (T, 3) and areas (T,)."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    cross = np.cross(b - a, c - a)
-    length = np.linalg.norm(cross, axis=1)
-    return cross / np.maximum(length, 1e-300)[:, None], length / 2.0
-
-
 def vertex_normals(body: BodyMesh) -> Points:
     """Return unit normals (V, 3), means of those of the faces around."""
     summed = area_normals(body.vertices, body.faces)

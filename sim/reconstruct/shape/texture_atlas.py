@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...composite.srgb import linear_to_srgb, srgb_to_linear
+from ...mpm.geometry.triangles import face_normals
 from ...scene.model import Camera
 from ...scene.shading import shading_values
 from ...smoothstep import smoothstep
-from ..mesh_raster import rasterise
+from ..mesh_raster import Number, rasterise
 from .body_texture import CropTexture, TexturedSurface, distance_behind, seen_vertices
 from .even_light import light_on
 from .hidden_seams import blended
@@ -30,14 +31,13 @@ from .plain_matter import PlainMatter, inner_colours, plain_matter, synthesised_
 from .surface_charts import surface_frame, unwrap
 from .surface_values import (
     SurfaceValues,
-    face_normals,
     flat_sides,
     sampled,
     smoothed,
     vertex_normals,
     vertex_share,
 )
-from .texture_shading import Number, corner_light, shading_of_charts, shading_of_photo, spread
+from .texture_shading import corner_light, shading_of_charts, shading_of_photo
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -85,7 +85,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     if photo.all():
         return TexturedSurface(body.vertices, body.faces, texture.uv(body.pixels), texture.pixels, texture.alpha)
     rest = body.faces[~photo]
-    normals, areas = face_normals(body.vertices, body.faces)
+    normals, areas = face_normals(body.vertices[body.faces])
     frame = surface_frame(normals, areas)
     pixels = _pixels_per_unit(camera, body.vertices)
     scale = DENSITY * pixels
@@ -134,7 +134,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     colour = _colours(texels, own, texture, inside, matter, falling, frame, pixels)
     if texture.alpha is not None:
         colour = np.column_stack([colour, _cover(camera, texels, texture)])
-    below = spread(found, np.clip(colour + 0.5, 0, 255).astype(np.uint8), (size[0], charts.size[1]))
+    below = found.spread(np.clip(colour + 0.5, 0, 255).astype(np.uint8), (size[0], charts.size[1]))
     whole = texture.pixels if texture.alpha is None else np.dstack([texture.pixels, texture.alpha])
     picture = _joined(whole, below)
     uv = np.column_stack([place[:, 0] / size[0], 1.0 - place[:, 1] / size[1]])
@@ -151,7 +151,7 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     of_normal = np.einsum("pk,pkc->pc", found.corners, lit[~photo][found.faces])
     above = shading_values(shading_of_photo(light, place, faces[photo], lit[photo]))
     shading = shading_values(shading_of_charts(light, texels, own.share, of_normal, corner))
-    return replace(surface, shading=_joined(above, spread(found, shading, (size[0], charts.size[1]))))
+    return replace(surface, shading=_joined(above, found.spread(shading, (size[0], charts.size[1]))))
 
 
 def _joined(photo: NDArray[Number], charts: NDArray[Number]) -> NDArray[Number]:
@@ -190,7 +190,7 @@ def _shown(camera: Camera, body: BodyMesh, mask: Mask) -> tuple[Mask, NDArray[np
 
     A face is hidden by others of the body, and where the photo's border cuts the object.
     """
-    normals, _ = face_normals(body.vertices, body.faces)
+    normals, _ = face_normals(body.vertices[body.faces])
     middle = body.vertices[body.faces].mean(axis=1)
     towards = camera.position - middle
     cosine = (normals * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)

@@ -8,20 +8,14 @@ camera.
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ..creases import split_creases
-from ..mesh_raster import VisiblePixels, rasterise
+from ..mesh_raster import rasterise
 from .even_light import BodyLight, Picture
 from .inflated_mesh import BodyMesh
 from .surface_values import Points, SurfaceValues, sampled
-
-Number = TypeVar("Number", bound=np.generic)
-
 
 MOST_TINT = 0.12
 """Largest logarithm of a channel's light over the mean of all: dark pixels hardly tell the colour of theirs."""
@@ -49,7 +43,7 @@ def shading_of_photo(light: BodyLight, place: Points, faces: NDArray[np.int64], 
     shown = rasterise(at, faces, (width, height))
     found = np.einsum("pk,pkc->pc", shown.corners, corners[shown.faces])
     found *= light.trust[shown.rows, shown.columns, None]
-    return spread(shown, found.astype(np.float32), (width, height))
+    return shown.spread(found.astype(np.float32), (width, height))
 
 
 def shading_of_charts(
@@ -63,14 +57,3 @@ def shading_of_charts(
     own, like = (sampled(light.trust[..., None], at - origin) for at in (texels.pixel, texels.counterpart))
     hidden = (1.0 - texels.unlit) * like * untinted(sampled(light.picture, texels.counterpart - origin))
     return np.asarray(hidden + seen * (own * of_normal - hidden))
-
-
-def spread(shown: VisiblePixels, values: NDArray[Number], size: tuple[int, int]) -> NDArray[Number]:
-    """Return ``values`` (P, C) of the pixels ``shown`` on a grid (h, w, C) of ``size`` (width, height), the nearest
-    ones where nothing is shown; zero everywhere if nothing is."""
-    result = np.zeros((size[1], size[0], values.shape[1]), dtype=values.dtype)
-    if not len(shown.rows):
-        return result
-    result[shown.rows, shown.columns] = values
-    nearest = ndimage.distance_transform_edt(~shown.on_grid(size), return_distances=False, return_indices=True)
-    return np.asarray(result[tuple(nearest)])
