@@ -31,6 +31,55 @@ def belt(seconds: float) -> Collider:
     return Collider(name="belt", surface=Surface(vertices=rest, faces=np.asarray(mesh.faces)), vertices=track)
 
 
+def closed_belt(seconds: float, keys: int) -> Collider:
+    """A belt round two rollers, seen as one solid: every vertex travels round its rim at SPEED, the shape stays.
+
+    Top at z = 0 from x = -0.6 to 0.6 m, rollers of 50 mm radius, 0.5 m wide.
+    """
+    straight, radius, width, count = 1.2, 0.05, 0.5, 108
+    turn = np.pi * radius
+    rim = 2 * (straight + turn)
+
+    def place(along: np.ndarray) -> np.ndarray:
+        """(n, 2) x and z of the distances (n,) in metres along the rim, from the top's left end."""
+        s = along % rim
+        right, left = (s - straight) / radius, (s - 2 * straight - turn) / radius
+        x = np.select(
+            [s < straight, s < straight + turn, s < 2 * straight + turn],
+            [s, straight + radius * np.sin(right), 2 * straight + turn - s],
+            -radius * np.sin(left),
+        )
+        z = np.select(
+            [s < straight, s < straight + turn, s < 2 * straight + turn],
+            [0.0, radius * (np.cos(right) - 1), -2 * radius],
+            -radius * (1 + np.cos(left)),
+        )
+        return np.stack([x - straight / 2, z], axis=1)
+
+    def rows(along: np.ndarray) -> np.ndarray:
+        """(2 n + 2, 3) both rims and the middles of both sides."""
+        ring = place(along)
+        sides = [np.insert(ring, 1, y, axis=1) for y in (-width / 2, width / 2)]
+        middles = [[[0.0, y, -radius]] for y in (-width / 2, width / 2)]
+        return np.concatenate([*sides, *middles])
+
+    here = np.arange(count)
+    after = (here + 1) % count
+    near, far = np.full(count, 2 * count), np.full(count, 2 * count + 1)
+    faces = np.concatenate(
+        [
+            np.stack([here, after, here + count], axis=1),
+            np.stack([after, after + count, here + count], axis=1),
+            np.stack([near, after, here], axis=1),
+            np.stack([far, here + count, after + count], axis=1),
+        ]
+    )
+    times = np.linspace(0.0, seconds, keys)
+    start = here * rim / count
+    track = Track(times=times, values=np.stack([rows(start + SPEED * t) for t in times]))
+    return Collider(name="belt", surface=Surface(vertices=rows(start), faces=faces), vertices=track)
+
+
 def turntable(spin: float, seconds: float, keys: int) -> Collider:
     """A disc whose vertices go round, top at z = 0."""
     mesh = trimesh.creation.cylinder(radius=0.4, height=0.1, sections=48).subdivide()
@@ -75,6 +124,36 @@ def test_a_belt_takes_a_soft_box_along(box, options, similarity):
         speeds.append(float(world.velocities(0)[:, 0].mean()))
     check_start(times, speeds, 0.03)
     assert abs(world.velocities(0)[:, 1].mean()) < 0.01 * SPEED
+
+
+@pytest.mark.long
+def test_a_belt_round_two_rollers_takes_a_rigid_box_along(box_body, rigid_bodies):
+    """What goes down round the end roller and back below the bodies does not slow the top."""
+    seconds, keys = 0.25, 6
+    setup = WorldSetup(
+        bodies=(box_body(center=(-0.3, 0.0, 0.1)),), colliders=(closed_belt(seconds, keys),), contacts=RUBBING
+    )
+    world = rigid_bodies(setup)
+    times, speeds = [], []
+    for k in range(keys - 1):
+        world.set_segments({0: (k * seconds / (keys - 1), (k + 1) * seconds / (keys - 1))})
+        world.advance(1e-3, 50)
+        times.append(seconds * (k + 1) / (keys - 1))
+        speeds.append(world.pose(0, "box").velocity[0])
+    check_start(times, speeds, 0.01)
+
+
+@pytest.mark.long
+def test_a_belt_round_two_rollers_takes_a_soft_box_along(box, options, similarity):
+    body = box(cells=(5, 5, 3), bottom=(-0.3, 0.0, 0.0))
+    belts = [closed_belt(0.25, 6)]
+    world = World(bodies=[body], colliders=belts, contacts=RUBBING, similarity=similarity, options=options)
+    times, speeds = [], []
+    for i in range(20):
+        world.advance(0.012)
+        times.append(0.012 * (i + 1))
+        speeds.append(float(world.velocities(0)[:, 0].mean()))
+    check_start(times, speeds, 0.03)
 
 
 @pytest.mark.long
