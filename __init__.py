@@ -22,7 +22,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .batch.stages import render
+    from .batch.stages import export_alembic, render
     from .physgen_addon.render.render_options import RenderOptions
     from .sim.app.bake import bake
     from .sim.app.bake_options import BakeOptions
@@ -87,6 +87,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "explain",
+    "export_alembic",
     "export_usd",
     "import_capture",
     "load_bake",
@@ -133,6 +134,7 @@ _HOMES = {
     "diagnose": ".sim.app.diagnose",
     "evaluate": ".sim.app.evaluate",
     "explain": ".sim.app.explain",
+    "export_alembic": ".batch.stages",
     "export_usd": ".sim.app.export_usd",
     "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",

@@ -175,7 +175,7 @@ def build_parser() -> CommandParser:
     why = "video of one plain body → why its simulation differs, with a video of both side by side"
     diagnosis_commands.add_explain(command("explain", diagnosis_commands.run_explain, why))
     diagnosis_commands.add_track(command("track", diagnosis_commands.run_track, "videos of a scene → capture folder"))
-    tables = "tables of measured motion (CSV, Tracker, DeepLabCut) → capture folder"
+    tables = "recorded motion (CSV, Tracker, DeepLabCut, C3D, ROS bags) → capture folder"
     diagnosis_commands.add_capture(command("capture", diagnosis_commands.run_capture, tables))
     lack = "capture of a real motion → effects missing from its simulation"
     diagnosis_commands.add_diagnose(command("diagnose", diagnosis_commands.run_diagnose, lack))
@@ -193,7 +193,7 @@ def build_parser() -> CommandParser:
     fitted = "scene folder → new scene folder whose objects no longer intersect"
     compose_commands.add_compose(command("compose", compose_commands.run_compose, fitted))
     scene_commands.add_export(
-        command("export", scene_commands.run_export, "scene folder, and its bake → USD with UsdPhysics bodies")
+        command("export", scene_commands.run_export, "scene folder, and its bake → USD or Alembic")
     )
 
     groups["Bakes"] = []

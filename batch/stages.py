@@ -31,6 +31,7 @@ from ..sim.scene.bake_quality import load_quality
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
 from ..sim.scene.textured_mesh import texture_pixels
+from .export import require_target
 
 if TYPE_CHECKING:
     from ..sim.app.default_motion import DefaultMotion
@@ -118,6 +119,30 @@ def run_render(
         command += ["--video", str(Path(video).resolve())]
     # Blender occasionally crashes when a video or a process ends; complete frames are kept, so try once more.
     return run_stage(command, on_event, cancelled, failure=RenderError, restarts=1)
+
+
+def export_alembic(
+    scene: Scene, bake: Bake, file: str | Path, *, on_event: OnEvent = ignore, cancelled: IsCancelled = never
+) -> None:
+    """Write the objects of ``scene`` with the motion of ``bake`` to the new ``file``, ``.abc``: meshes, grains, camera.
+
+    Blender runs in a process of its own; its first frame is the bake's. Grains are vertices, liquids their surface.
+
+    >>> import physgen
+    >>> scene, baked = physgen.load_scene("scene"), physgen.load_bake("bake")  # doctest: +SKIP
+    >>> physgen.export_alembic(scene, baked, "scene.abc")  # doctest: +SKIP
+
+    Raises InputError where the file exists or the bake is of another scene, RenderError when Blender fails; Cancelled.
+    """
+    run_export(scene, bake, Path(file), on_event, cancelled)
+
+
+def run_export(scene: Scene, bake: Bake, file: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
+    """Return the ``done`` event of the process of ``export_alembic``."""
+    require_target(scene, bake, file)
+    command = own_command("batch.export", str(scene.root.resolve()), "--bake", str(bake.root.resolve()))
+    command += ["--out", str(file.resolve()), "--json", "--parent", str(os.getpid())]
+    return run_stage(command, on_event, cancelled, failure=RenderError)
 
 
 @dataclass(frozen=True, kw_only=True)

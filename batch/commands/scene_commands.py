@@ -69,17 +69,28 @@ def run_pack(options: argparse.Namespace, terminal: Terminal, cancelled: IsCance
 
 def add_export(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``physgen export``."""
+    parser.set_defaults(wrong_usage=parser.error)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     parser.add_argument("--bake", type=Path, metavar="BAKE", help="bake folder, whose motion is written too")
-    parser.add_argument("--usd", type=Path, required=True, metavar="FILE", help="new file, .usda (text) or .usdc")
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument(
+        "--usd", type=Path, metavar="FILE", help="new file, .usda (text) or .usdc, with UsdPhysics bodies"
+    )
+    target.add_argument("--alembic", type=Path, metavar="FILE", help="new file, .abc, of the bake's motion; needs bpy")
 
 
 def run_export(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen export``; the exit code."""
     from ...sim.app.export_usd import export_usd, require_scene
 
+    if options.alembic is not None and options.bake is None:
+        options.wrong_usage("--alembic needs --bake")
     require_scene(options.scene)
     bake = None if options.bake is None else load_bake(options.bake)
+    if options.alembic is not None and bake is not None:
+        terminal(stages.run_export(load_scene(options.scene), bake, options.alembic, terminal, cancelled))
+        terminal.line(f"Alembic: {options.alembic}")
+        return 0
     for note in export_usd(load_scene(options.scene), options.usd, bake=bake, cancelled=cancelled):
         terminal({"event": "notice", "stage": "export", "message": note})
     terminal({"event": "done", "stage": "export", "out": str(options.usd)})

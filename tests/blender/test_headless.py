@@ -63,7 +63,7 @@ def bare(tmp_path_factory):
 
 
 def test_help_and_usage_need_no_scene(tmp_path):
-    scripts = ["render.py", "bake.py", "reconstruct.py", "diagnose.py"]
+    scripts = ["render.py", "export.py", "bake.py", "reconstruct.py", "diagnose.py"]
     asked = [start(tmp_path, sys.executable, BATCH / name, "--help") for name in scripts]
     wrong = [start(tmp_path, sys.executable, BATCH / name, "--", "--nonsense") for name in scripts[:2]]
     for name, process in zip(scripts, asked, strict=True):
