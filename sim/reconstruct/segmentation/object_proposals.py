@@ -37,6 +37,7 @@ from .proposal_features import (
     share_on_edges,
     solidity_of,
 )
+from .round_things import round_things
 from .whole_objects import Candidate, whole_objects
 
 Pixels = NDArray[np.uint8]
@@ -99,7 +100,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
         x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
-    return with_model(things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)
+    alike = round_things(pixels, result, LEFT_ASIDE + 0.01)
+    return with_model(alike or things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)[:most]
 
 
 def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float]) -> list[float]:
