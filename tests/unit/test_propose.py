@@ -232,13 +232,23 @@ def masks_of(*boxes):
 def test_what_is_cut_or_tiny_is_used_where_there_is_nothing_else():
     whole, cut, speck = (60, 20, 110, 80), (150, 0, 200, 60), (20, 70, 28, 78)
     scores = [0.95, 0.97, 0.99]
-    assert with_the_rest_aside(masks_of(whole, cut, speck), scores) == [0.95, LEFT_ASIDE, LEFT_ASIDE]
-    assert with_the_rest_aside(masks_of(cut, speck), scores[1:]) == [0.97, LEFT_ASIDE]
-    assert with_the_rest_aside(masks_of(speck), scores[2:]) == [0.99]
-    assert with_the_rest_aside([], []) == []
+    assert with_the_rest_aside(masks_of(whole, cut, speck), scores, [0.0] * 3) == [0.95, LEFT_ASIDE, LEFT_ASIDE]
+    assert with_the_rest_aside(masks_of(cut, speck), scores[1:], [0.0] * 2) == [0.97, LEFT_ASIDE]
+    assert with_the_rest_aside(masks_of(speck), scores[2:], [0.0]) == [0.99]
+    assert with_the_rest_aside([], [], []) == []
     # A poor one neither makes others tiny nor is raised.
     poor = (0, 0, 190, 99)
-    assert with_the_rest_aside(masks_of(poor, speck), [0.6, 0.99]) == [0.6, 0.99]
+    assert with_the_rest_aside(masks_of(poor, speck), [0.6, 0.99], [0.0, 0.0]) == [0.6, 0.99]
+
+
+def test_a_strip_of_the_mat_is_not_used_beside_the_meal_but_where_there_is_nothing_else():
+    meal, strip = (60, 20, 110, 80), (120, 60, 190, 80)
+    masks, scores = masks_of(meal, strip), [0.99, 0.93]
+    assert with_the_rest_aside(masks, scores, [0.1, 0.9]) == [0.99, LEFT_ASIDE]
+    assert with_the_rest_aside(masks, scores, [0.1, 0.6]) == [0.99, 0.93]
+    assert with_the_rest_aside(masks, scores, [0.8, 0.9]) == [0.99, 0.93]
+    # What is left aside itself says nothing about the others.
+    assert with_the_rest_aside(masks, [0.6, 0.93], [0.1, 0.9]) == [0.6, 0.93]
 
 
 def test_a_model_s_alpha_becomes_boxes():

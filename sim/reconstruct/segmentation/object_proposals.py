@@ -63,6 +63,9 @@ CUT = 0.02
 """Share of its box' outline on the photo's border from which a thing is cut."""
 SIDES = 0.02
 """Strip along the photo's left and right border, over its width, that what goes through the photo reaches."""
+GROUND, THING = 0.7, 0.5
+"""Share of a candidate that could be ground, lit or shaded, from which it is left aside beside one that is below the
+second share: strips of a mat beside a meal, blinds of a window, the gap in a handle."""
 LEFT_ASIDE = 0.79
 """Largest score of what is left aside, below that of objects that are used unless the user says otherwise."""
 
@@ -89,13 +92,17 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
     sharp = in_focus([item.mask for item, _ in found], small)
     found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
-    shade = FEATURES.index("shade")
+    shade, ground = FEATURES.index("shade"), FEATURES.index("ground")
     whole = whole_objects(
         [Candidate(item.mask, value, bool(item.features[shade])) for item, value in found], _lab_of(small)
     )
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
-    listed = with_the_rest_aside([found[i][0].mask for i in whole], [found[i][1] for i in whole])
+    listed = with_the_rest_aside(
+        [found[i][0].mask for i in whole],
+        [found[i][1] for i in whole],
+        [float(found[i][0].features[ground]) for i in whole],
+    )
     for item, value in sorted(zip((found[i][0] for i in whole), listed, strict=True), key=lambda pair: -pair[1])[:most]:
         x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
@@ -104,12 +111,16 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     return with_model(alike or things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)[:most]
 
 
-def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float]) -> list[float]:
+def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float], ground: Sequence[float]) -> list[float]:
     """Return the ``scores`` of the objects ``masks`` (h, w), at most ``LEFT_ASIDE`` for what a photo is not of.
 
-    Left aside are objects that are tiny beside the largest one, and, where another is whole, those cut by the photo's
-    border: their remainder is unknown, so they cannot be moved.
+    ground: share of each that could be ground. Left aside are those that mostly are, where another is not; objects
+    that are tiny beside the largest one; and, where another is whole, those cut by the photo's border: their remainder
+    is unknown, so they cannot be moved.
     """
+    if any(share < THING and score > LEFT_ASIDE for share, score in zip(ground, scores, strict=True)):
+        told = zip(scores, ground, strict=True)
+        scores = [min(score, LEFT_ASIDE) if share >= GROUND else score for score, share in told]
     areas = [int(mask.sum()) for mask in masks]
     largest = max((area for area, score in zip(areas, scores, strict=True) if score > LEFT_ASIDE), default=0)
     main = [area >= BESIDE * largest for area in areas]

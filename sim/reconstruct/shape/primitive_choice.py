@@ -20,8 +20,9 @@ from scipy import ndimage
 from scipy.optimize import minimize
 
 from ...scene.model import Camera
+from .flat_disc import is_disc, looks_down
 from .inflate import Crop
-from .primitive_fit import InnerEdges, fit_box, fit_cylinder, fit_sphere
+from .primitive_fit import InnerEdges, fit_box, fit_cylinder, fit_disc, fit_sphere
 from .primitives import Outline, Primitive, Sphere, SurfaceOfRevolution, outline_of, rasterize
 
 FURNITURE = "furniture"
@@ -252,7 +253,7 @@ def choose_primitive(
         found = candidates.of(kind.shape)
         if found is not None and max(found.overlap, candidates.bare_overlap(found.primitive)) >= OF_KIND:
             return found
-    return candidates.best()
+    return candidates.lying(candidates.best())
 
 
 class _Candidates:
@@ -309,6 +310,16 @@ class _Candidates:
         if found:
             return max(found, key=lambda item: item[0])[1]
         return self._handled()
+
+    def lying(self, found: PrimitiveChoice | None) -> PrimitiveChoice | None:
+        """Return ``found``, or a disc that lies on the ground if it is round, seen from above and looks flat."""
+        seen_round = found is not None and isinstance(found.primitive, Sphere | SurfaceOfRevolution)
+        if not seen_round or self._pixels is None or not looks_down(self._camera):
+            return found
+        flat = self._judged(fit_disc(self._camera, self._outline))
+        if flat is None or flat.overlap < CLEAR or not is_disc(self._pixels, self._full & self._seen):
+            return found
+        return flat
 
     def _handled(self) -> PrimitiveChoice | None:
         """A cylinder with a handle."""

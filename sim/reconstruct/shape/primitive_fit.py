@@ -326,6 +326,28 @@ def _flat(primitive: Primitive, share: float = 1.0) -> bool:
     return primitive.height < share * STUMP * sum(primitive.radii)
 
 
+DISC = 0.12
+"""Height over diameter of a disc that lies: coins and buttons have 0.06 to 0.2."""
+
+
+def fit_disc(camera: Camera, outline: Outline) -> tuple[Primitive, float] | None:
+    """Return the disc that lies on the ground with the outline nearest to ``outline``, and its cost."""
+    start = start_of(camera, outline)
+    if start is None:
+        return None
+    middle = on_ground(camera, (outline.points.min(axis=0) + outline.points.max(axis=0))[None] / 2.0)[0]
+    if not np.isfinite(middle).all():
+        return None
+    radius = start.size / np.sqrt(np.pi)
+
+    def build(p: Parameters) -> SurfaceOfRevolution:
+        wide = radius * float(_log(p[2:3])[0])
+        x, y = middle[:2] + radius * p[:2]
+        return SurfaceOfRevolution(float(x), float(y), (0.0, 2.0 * DISC * wide), (wide, wide))
+
+    return _search(build, [np.zeros(3)], camera, outline)
+
+
 def fit_box(
     camera: Camera,
     outline: Outline,
