@@ -120,6 +120,19 @@ def test_a_coloured_foot_is_added_and_what_leaves_the_box_is_not():
     assert not (lacking((45, 42, 40), shadow=(40, 60, 160), box=(60, 5, 260, 225)) & SHADOW).any()
 
 
+@pytest.mark.parametrize(("inset", "taken"), [(2, True), (12, False)])
+def test_a_strap_that_goes_on_to_the_photos_border_is_added_where_the_box_ends_there_too(inset, taken):
+    body = (np.abs(COLUMNS - 150) < 80) & (ROWS > 60) & (ROWS < 225)
+    strap = (np.abs(np.hypot(COLUMNS - 226, ROWS - 130) - 84) < 10) & (COLUMNS > 226)
+    leather = np.random.default_rng(1).normal((60, 40, 35), 25.0, (int(strap.sum()), 3))
+    picture = photo(WHITE, [(strap, leather), (body, (110, 70, 50))])
+    assert strap[:, -1].any()
+    box = (60, 20, WIDTH - inset, 235)
+    added = missing_parts(picture, body, box, plain_backdrop(picture))
+    assert ((added & strap).sum() > 0.9 * (strap & ~body).sum()) == taken
+    assert ((added & strap).sum() > 0.1 * strap.sum()) == taken
+
+
 def test_a_mask_that_lacks_nothing_is_left_alone():
     picture = photo(sweep(), [(TOY, (200, 110, 40))])
     assert not missing_parts(picture, TOY, (60, 5, 300, 225), plain_backdrop(picture)).any()

@@ -54,6 +54,8 @@ FULL = 0.95
 """Share of the photo above which a box has no margin: nothing would be left around it."""
 INSET = 0.006
 """Least distance of such a box from the photo's border, over the photo's sides."""
+NEAR_BORDER = 0.02
+"""Distance of a box' side from the photo's border, over the photo's side, below which it stands for the border."""
 SCORE = 0.95
 """Score of a thing before a plain backdrop."""
 WHOLE = 0.995
@@ -178,7 +180,7 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     near = cv2.dilate(own.astype(np.uint8), _disc(SEAM)) > 0
     parts = cv2.morphologyEx((~backdrop & ~own & unlike).astype(np.uint8), cv2.MORPH_OPEN, _disc(SEAM)) > 0
     parts = touching(parts, near)
-    x0, y0, x1, y1 = box
+    x0, y0, x1, y1 = _to_border(box, mask.shape)
     within = nothing.copy()
     within[y0 + 1 if y0 else 0 : y1 - 1 if y1 < len(mask) else y1,
            x0 + 1 if x0 else 0 : x1 - 1 if x1 < mask.shape[1] else x1] = True  # fmt: skip
@@ -199,6 +201,21 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     reach = round(SEAM * max(across, down)) + 1
     beside = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
     return np.asarray((full | (beside & _thin_between(mask, full, reach))) & ~mask & within)
+
+
+def _to_border(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """``box`` with the sides that are near the border of a photo of that ``shape`` moved there: a box around all of a
+    photo ends before it, and what it holds may not.
+    """
+    height, width = shape[:2]
+    near_x, near_y = NEAR_BORDER * width, NEAR_BORDER * height
+    x0, y0, x1, y1 = box
+    return (
+        x0 if x0 > near_x else 0,
+        y0 if y0 > near_y else 0,
+        x1 if x1 < width - near_x else width,
+        y1 if y1 < height - near_y else height,
+    )
 
 
 def _thin_between(mask: Mask, part: Mask, reach: int) -> Mask:
