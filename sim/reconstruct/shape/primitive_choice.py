@@ -312,9 +312,9 @@ class _Candidates:
         return self._handled()
 
     def lying(self, found: PrimitiveChoice | None) -> PrimitiveChoice | None:
-        """Return ``found``, or a disc that lies on the ground if it is round, seen from above and looks flat."""
-        seen_round = found is not None and isinstance(found.primitive, Sphere | SurfaceOfRevolution)
-        if not seen_round or self._pixels is None or not looks_down(self._camera):
+        """Return ``found``, or a disc that lies on the ground if it is a ball seen from above that looks flat."""
+        ball = found is not None and isinstance(found.primitive, Sphere)
+        if not ball or self._pixels is None or not looks_down(self._camera):
             return found
         flat = self._judged(fit_disc(self._camera, self._outline))
         if flat is None or flat.overlap < CLEAR or not is_disc(self._pixels, self._full & self._seen):
