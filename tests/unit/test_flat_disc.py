@@ -75,3 +75,16 @@ def test_nothing_is_told_by_nothing():
     dot[5:8, 5:8] = True
     assert smooth_share(pixels, empty) == smooth_share(pixels, dot) == 1.0
     assert not is_disc(pixels, dot)
+
+
+def test_most_of_many_decide():
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    masks = [np.hypot(columns - x, rows - y) < 30 for y in (60, 160) for x in (50, 125, 200, 275)]
+    picture = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
+    for i, mask in enumerate(masks):
+        own = painted(mask, shaded=i == 0, relief=0.0 if i == 0 else 0.35, seed=i)
+        picture[mask] = own[mask]
+    assert smooth_share(picture, masks[0]) > 0.8
+    assert is_disc(picture, masks[0]) and is_disc(picture, masks[1])
+    alone = np.where(masks[0][..., None], picture, np.uint8(40))
+    assert not is_disc(alone, masks[0])
