@@ -130,6 +130,7 @@ def _plain_fit(fit: CandidateFit) -> dict[str, Any]:
         "heldout_elsewhere": list(fit.heldout_elsewhere),
         "bending": fit.bending,
         "misfit": fit.misfit,
+        "limit": fit.limit,
         "heldout_log_score": [float(s) for s in fit.heldout_log_score],
         "parameters": {
             name: {k: [e.value, e.low, e.high, e.unit] for k, e in values.items()}
@@ -148,6 +149,7 @@ def _read_fit(value: Mapping[str, Any]) -> CandidateFit:
         heldout_elsewhere=tuple(bool(x) for x in value.get("heldout_elsewhere") or ()),
         bending=float(value.get("bending") or 0.0),
         misfit=_number(value["misfit"]),
+        limit=_number(value.get("limit")),
         heldout_log_score=np.array([_number(s) for s in value["heldout_log_score"]]),
         parameters={
             name: {

@@ -56,6 +56,8 @@ class CandidateFit:
         whole trials; of single tracked points, measured for the nominal model and the re-fitted one. Else 0.
     misfit: RMS residual over what noise and numerical error would leave; 1 is explained, far above 1 means that
         something is still missing.
+    limit: of a deformable body, misfit above which the right candidate leaves one in six times, by what two lattices
+        leave open; NaN of a rigid one, whose limit is a constant of the comparison.
     """
 
     effects: tuple[str, ...]
@@ -69,6 +71,7 @@ class CandidateFit:
     heldout_trials: tuple[float, ...] = ()
     heldout_elsewhere: tuple[bool, ...] = ()
     bending: float = 0.0
+    limit: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)

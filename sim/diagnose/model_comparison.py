@@ -72,9 +72,7 @@ def compare_models(fits: FittedModels, weighing: ComparisonSettings) -> ModelCom
     grain = math.hypot(fits.floor_rms_m, fits.grain_rms_m)
     against = against_none(fits, weighing)
     weights = _weights(candidates, weighing, grain, far=against.left == 0.0)
-    adequate = [
-        _adequacy(c.misfit, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates
-    ]
+    adequate = [_adequacy(c, candidates[0].misfit, weighing) * _shown(c, candidates[0], weighing) for c in candidates]
     adequate[0] *= against.left
     shares = [w * a for w, a in zip(weights, adequate, strict=True)]
     predicted = [_predicted(c, fits, weighing) for c in candidates]
@@ -271,18 +269,27 @@ def _shown(fit: CandidateFit, nominal: CandidateFit, weighing: ComparisonSetting
     left = _left(fit, nominal)
     if not fit.effects or left < weighing.predicts or not math.isfinite(nominal.heldout_rms_m):
         return 1.0
+    if math.isfinite(fit.limit):
+        # Of a deformable body trials and held-out motion are simulated on the same lattices: what only the trials
+        # gain may be the lattice's own error.
+        return 0.0
     return weighing.unshown * min(1.0, 1.0 / left) if math.isfinite(left) else 0.0
 
 
-def _adequacy(misfit: float, nominal: float, weighing: ComparisonSettings) -> float:
-    """Return the probability that the right candidate leaves ``misfit`` where the nominal model leaves ``nominal``."""
+def _adequacy(fit: CandidateFit, nominal: float, weighing: ComparisonSettings) -> float:
+    """Return the probability that the right candidate leaves the misfit of ``fit`` where the nominal model leaves
+    ``nominal``: one half at its limit, and at a misfit of 1 the same whatever the limit."""
+    misfit, sharpness = fit.misfit, weighing.sharpness
     if not math.isfinite(misfit) or misfit <= 0:
         return 0.0
     # A candidate that removes nine tenths of a large misfit may leave more than one that removes little.
     left = misfit / nominal if math.isfinite(nominal) and nominal > 0 else 1.0
     explained = min(max((0.6 - left) / 0.3, 0.0), 1.0)
     enough = weighing.enough + explained * (weighing.enough_explained - weighing.enough)
-    exponent = weighing.sharpness * math.log(misfit / enough)
+    if math.isfinite(fit.limit):
+        enough = fit.limit
+        sharpness *= math.log(weighing.enough) / math.log(enough)
+    exponent = sharpness * math.log(misfit / enough)
     return 1.0 / (1.0 + math.exp(min(max(exponent, -60.0), 60.0)))
 
 

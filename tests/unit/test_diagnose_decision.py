@@ -45,7 +45,9 @@ class Found:
     grain_rms_m: float = 0.0
 
 
-def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), elsewhere=(), bending=0.0):
+def fit(
+    *effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), elsewhere=(), bending=0.0, limit=math.nan
+):
     parameters = {name: {"x": Estimate(value=1.0, unit="1", low=0.5, high=1.5)} for name in effects}
     return CandidateFit(
         effects=effects,
@@ -58,6 +60,7 @@ def fit(*effects, evidence=0.0, misfit=1.0, rms=None, chi=math.nan, trials=(), e
         heldout_trials=tuple(trials),
         heldout_elsewhere=tuple(elsewhere),
         bending=bending,
+        limit=limit,
     )
 
 
@@ -164,6 +167,29 @@ def test_chaotic_held_out_motion_does_not_veto_a_large_gain():
 
     assert verdict(adhesion, 0.0237) == "adhesion"
     assert verdict(adhesion, 0.0) == UNKNOWN and verdict(little, 0.0237) in (NONE, UNKNOWN)
+
+
+@pytest.mark.parametrize(("misfit", "limit", "named"), [(1.0, 1.27, True), (1.5, 1.27, False), (1.5, 1.8, True)])
+def test_what_a_deformable_leaves_is_measured_by_what_its_lattices_leave_open(misfit, limit, named):
+    damping = fit("internal_damping", evidence=500.0, misfit=misfit, limit=limit)
+    found = weighed(damping, nominal_misfit=1.7)
+    assert (found.verdict.effect, found.probabilities[UNKNOWN] > 0.9) == (
+        ("internal_damping", False) if named else (UNKNOWN, True)
+    )
+
+
+def test_a_cause_of_a_deformable_that_predicts_no_better_is_not_named():
+    """Beams: both lattices of the simulator are as far apart as the gap, and a stiffness gains 851 nats on trials."""
+    nominal = fit(misfit=1.0, rms=0.084, limit=1.7)
+    stiffer, better = (fit("stiffness", evidence=851.0, rms=rms, limit=1.7) for rms in (0.098, 0.02))
+
+    def verdict(candidate):
+        models = Found(
+            nominal=nominal, refitted=nominal, candidates=(candidate,), floor_rms_m=0.0014, grain_rms_m=0.103
+        )
+        return compare_models(models, ComparisonSettings()).verdict.effect
+
+    assert verdict(stiffer) == UNKNOWN and verdict(better) == "stiffness"
 
 
 def test_a_trial_that_tumbles_chaotically_does_not_decide_what_predicts_better():

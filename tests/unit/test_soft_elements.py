@@ -10,8 +10,9 @@ import taichi as ti
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.soft.body_mesh import body_mesh
+from physgen.sim.diagnose.soft.body_mesh import body_mesh, coarser, extrapolated
 from physgen.sim.diagnose.soft.free_flight import State
+from physgen.sim.diagnose.soft.model_errors import ModelError, misfit_left_open, modulus_between
 from physgen.sim.diagnose.soft.soft_candidates import WorldParameters
 from physgen.sim.diagnose.soft.soft_simulator import SimulationJob, SoftWorlds, concentrated_masses
 
@@ -49,6 +50,38 @@ def test_points_are_found_in_their_cells(place):
     nodes, weights = mesh.locate(np.array([place]))
     assert weights.min() > -1e-9
     assert np.allclose((weights[0][:, None] * mesh.nodes[nodes[0]]).sum(axis=0), place, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lattice", "rough"), [((14, 5, 5), (11, 4, 4)), ((8, 8, 8), (5, 5, 5)), ((9, 3, 3), (6, 2, 2))]
+)
+def test_a_coarser_lattice_keeps_four_boxes_across(lattice, rough):
+    shape = trimesh.creation.box(tuple(0.01 * n for n in lattice))
+    surface = np.asarray(shape.vertices), np.asarray(shape.faces)
+    mesh = body_mesh(*surface, lattice=lattice)
+    coarse = coarser(mesh, *surface, factor=1.5)
+    assert coarse.lattice == rough
+    # Errors of second order: e_coarse = ratio² e_fine.
+    ratio = (np.prod(lattice) / np.prod(rough)) ** (1 / 3)
+    assert extrapolated(mesh, coarse) * (ratio**2 - 1) == pytest.approx(1.0)
+
+
+def test_a_difference_of_lattices_as_a_change_of_modulus():
+    rng = np.random.default_rng(0)
+    fine, slope, other = rng.normal(size=(3, 6, 5, 3))
+    other -= slope * (slope * other).sum() / (slope * slope).sum()
+    coarse, stiffer = fine + 0.07 * slope + 0.1 * other, fine + 0.02 * slope
+    coarse[0, 0], stiffer[1, 1] = np.nan, np.nan
+    parts = [coarse - 0.1 * other], [stiffer]
+    assert modulus_between([fine], *parts, 0.02) == pytest.approx(0.07)
+    whole = np.isfinite(coarse) & np.isfinite(stiffer)
+    expected = ((coarse - fine)[whole] * slope[whole]).sum() / (slope[whole] ** 2).sum()
+    assert modulus_between([fine], [coarse], [stiffer], 0.02) == pytest.approx(expected)
+
+
+def test_what_the_right_candidate_may_leave():
+    assert misfit_left_open(ModelError(drift=0.0, ringing=1e-9), 1e-3) == pytest.approx(1.1)
+    assert misfit_left_open(ModelError(drift=0.0, ringing=1.0), 1e-3) == pytest.approx(math.exp(0.6), rel=1e-3)
 
 
 def test_a_homogeneous_stretch_leaves_no_force_inside():

@@ -9,7 +9,7 @@ import pytest
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.soft.body_mesh import body_mesh
 from physgen.sim.diagnose.soft.candidate_survey import Survey
-from physgen.sim.diagnose.soft.contact_search import CandidateSearch, ContactProblem
+from physgen.sim.diagnose.soft.contact_search import CandidateSearch
 from physgen.sim.diagnose.soft.flight_fits import Flights, GroundFrame, fit_in_flight, soft_trial
 from physgen.sim.diagnose.soft.free_flight import State
 from physgen.sim.diagnose.soft.soft_candidates import WorldParameters, candidates
@@ -44,10 +44,11 @@ def cube_surface(side=0.06, cells=4, away=False):
     return lattice[used], again.reshape(-1, 3)
 
 
-def capture(world, *, takes=3, after=0.15, seed=0):
+def capture(world, *, takes=3, after=0.15, seed=0, cells=4):
+    """Return a capture of a cube of 4 boxes a side, and what it withholds; ``cells``: a side, of what is recorded."""
     rng = np.random.default_rng(seed)
     vertices, faces = cube_surface()
-    mesh = body_mesh(vertices, faces)
+    mesh = body_mesh(vertices, faces, lattice=(cells,) * 3)
     rest = rng.uniform(-0.03, 0.03, size=(14, 3))
     worlds = SoftWorlds(mesh, 400.0, rest, threads=1)
     times = np.arange(0, 0.25 + after, 1 / 200)
@@ -198,22 +199,35 @@ def test_no_effect_is_found_in_plain_motion():
     assert max(c.log_evidence for c in found.candidates) < found.refitted.log_evidence + 3
 
 
+def test_a_lattice_that_is_too_stiff_is_no_cause():
+    """A cube of four boxes a side is stiffer than one of nine, by what the two lattices of the survey leave open."""
+    made, _ = capture(NOMINAL, after=0.05, cells=9)
+    survey = Survey(made, on_event=ignore, cancelled=never, work=Work())
+    neutral = CandidateSearch(survey.problem, None)
+    plain = neutral.descend(neutral.try_all([neutral.mean])[0], 4, never)
+    assert -3 * survey.problem.modulus_spread < plain.free[-1] < 0
+    (stiffness,) = candidates(NOMINAL, 0.03, np.zeros(3))["stiffness"]
+    search = CandidateSearch(survey.problem, stiffness)
+    found = search.descend(search.try_all([np.array([-0.03, *plain.free[:2], 0.0])])[0], 4, never)
+    assert search.log_evidence(found) < neutral.log_evidence(plain) + 3
+
+
 def test_parameters_are_as_sure_as_trials_that_share_errors_and_two_lattices_make_them():
     made, _ = capture(dataclasses.replace(NOMINAL, factor=0.8), after=0.02)
     survey = Survey(made, on_event=ignore, cancelled=never, work=Work())
     (stiffness,) = candidates(NOMINAL, 0.03, np.zeros(3))["stiffness"]
-    one, size = survey.problem, 0.03
-    four = ContactProblem(survey.flights, one.windows * 4, one.base, model_error=one.model_error, size=size)
+    one = survey.problem
+    four = dataclasses.replace(one, windows=list(one.windows) * 4)
     searches = [CandidateSearch(problem, stiffness) for problem in (one, four)]
-    free = np.array([np.log(0.8), 0.0, 0.0])
+    free = np.array([np.log(0.8), 0.0, 0.0, 0.0])
     fit, repeated = (search.with_jacobians(search.try_all([free])[0]) for search in searches)
     # Four times the same trials, sharing their errors, are worth one.
     shared = searches[1].covariance(repeated)
     assert np.allclose(shared, np.linalg.inv(searches[0].normal_equations(fit)[1]), rtol=1e-6, atol=0)
     assert 1e-4 < np.sqrt(shared[0, 0]) < 0.05
-    moved = np.array([-0.03, 9.0, 0.0])
+    moved = np.array([-0.03, 9.0, 0.0, 0.0])
     added = searches[1].covariance(repeated, moved) - shared
-    assert np.allclose(added, np.diag([(0.03 / 1.96) ** 2, searches[1].spread[1] ** 2, 0.0]), atol=1e-12)
+    assert np.allclose(added, np.diag([(0.03 / 1.96) ** 2, searches[1].spread[1] ** 2, 0.0, 0.0]), atol=1e-12)
 
 
 def test_unsupported_captures_are_reported():

@@ -15,9 +15,20 @@ from ...events import IsCancelled, OnEvent, StageProgress
 from ..capture import Capture
 from ..capture_geometry import mean_known
 from ..work import Work
-from .body_mesh import body_mesh, coarser
-from .contact_search import LOST, CandidateSearch, ContactFit, ContactProblem, ModelError, Window, model_error_between
+from .body_mesh import body_mesh, coarser, extrapolated
+from .contact_search import (
+    COMMON,
+    COMMON_STEP,
+    LEAST_MODULUS,
+    LOST,
+    MOST_MODULUS,
+    CandidateSearch,
+    ContactFit,
+    ContactProblem,
+    Window,
+)
 from .flight_fits import FlightEstimate, Flights, GroundFrame, fit_in_flight, soft_trial
+from .model_errors import ModelError, misfit_left_open, model_error_between, modulus_between
 from .soft_candidates import IN_FLIGHT, Candidate, WorldParameters, candidates
 from .soft_simulator import SoftWorlds
 
@@ -48,6 +59,9 @@ NEARBY = (-0.12, 0.0, 0.12)
 FULL_SEARCHES = 3
 """Candidates searched on the fine lattice."""
 
+PROMISING = 10.0
+"""Nats that the linear model must promise of a candidate that begins beside the model without it, to be followed."""
+
 SOFT_GROUND = math.log(0.2)
 """Second starting value of the log ground stiffness, besides its default."""
 
@@ -62,7 +76,7 @@ FREEDOM = 4.0
 class FoundFit:
     """A fit, the search that found it, and the effects added before the candidate's own.
 
-    moved: (p + 2,) from the optimum on the coarse lattice to that on the fine one, None where one of both is unknown.
+    moved: (p + 3,) by which, with 95 %, the optimum of a body without cells is farther, None where that is unknown.
     """
 
     search: CandidateSearch
@@ -111,14 +125,21 @@ class Survey:
         self.fit_trials = [i for i, t in enumerate(self.trials) if t.role == "fit"]
         self._check()
         coarse_mesh = coarser(mesh, item.vertices, item.faces, factor=COARSER)
+        self._extrapolated = extrapolated(mesh, coarse_mesh)
         rough_worlds = SoftWorlds(coarse_mesh, belief.density_kg_m3, rest, work=work)
         self._coarse = Flights(self.trials, rough_worlds, capture.noise_sigma)
         windows = [w for w in map(self._window, self.fit_trials) if w is not None]
-        self.numerics_rms_m, model_error = self._measure_grain(windows)
-        self.problem = ContactProblem(self.flights, windows, self.base, model_error=model_error, size=self._size)
-        self._rough = ContactProblem(
-            self._coarse, windows, self.base, model_error=model_error.times(1.5), size=self._size
+        self.numerics_rms_m, model_error, spread = self._measure_grain(windows)
+        self.problem = ContactProblem(
+            flights=self.flights,
+            windows=windows,
+            base=self.base,
+            model_error=model_error,
+            modulus_spread=spread,
+            size=self._size,
         )
+        self.limit = misfit_left_open(model_error, capture.noise_sigma)
+        self._rough = self.problem.coarser(self._coarse)
 
     def run(self, names: Sequence[str]) -> None:
         """Search all candidates of ``names``."""
@@ -127,7 +148,7 @@ class Survey:
         known = candidates(base, self._size, middle)
         neutral = CandidateSearch(problem, None)
         rough = CandidateSearch(self._rough, None)
-        grounds = rough.try_all([rough.mean, np.array([0.0, SOFT_GROUND])])
+        grounds = rough.try_all([rough.mean, np.array([0.0, SOFT_GROUND, 0.0])])
         end = min((rough.descend(g, ROUNDS, self._stop) for g in grounds), key=lambda f: f.cost)
         self._common = end.free
         self.believed, refitted = neutral.try_all([neutral.mean, end.free])
@@ -143,7 +164,7 @@ class Survey:
             in_flight.append((candidate, fit_in_flight(self.flights, self.fit_trials, base, candidate)))
         self._report(25, "flights")
         tried = [c for n in names if n not in IN_FLIGHT for c in known[n]]
-        self.found = self._contact_effects(problem, self._rough, tried)
+        self.found = self._contact_effects(problem, self._rough, tried, refitted)
         self.found += [self._landed(candidate, air) for candidate, air in in_flight]
         self.found += self._pairs(tried)
         self._report(92, "held-out motion")
@@ -151,7 +172,7 @@ class Survey:
     def _landed(self, candidate: Candidate, air: FlightEstimate) -> FoundFit:
         """Return an effect fitted in flight, also searched in contact where it is visible there."""
         refitted, search = self.plain.fit, CandidateSearch(self.problem, candidate, air)
-        start = np.concatenate([air.free, refitted.free[-2:]])
+        start = np.concatenate([air.free, refitted.free[-COMMON:]])
         if float(self.flight_chi2.sum() - air.chi2.sum()) > SEEN_IN_FLIGHT and not self._late(0.8):
             fit = search.descend(search.try_all([start])[0], 2, self._stop)
         else:
@@ -162,17 +183,20 @@ class Survey:
         return FoundFit(search=search, fit=fit, in_flight=air)
 
     def _contact_effects(
-        self, problem: ContactProblem, rough: ContactProblem, tried: list[Candidate]
+        self, problem: ContactProblem, rough: ContactProblem, tried: list[Candidate], without: ContactFit
     ) -> list[FoundFit]:
-        """Search ``tried`` from all their starts on the coarse lattice, then the best on the fine one."""
+        """Search ``tried`` from all their starts on the coarse lattice, then the best on the fine one.
+
+        without: the fit without any of them, from which the others are searched again.
+        """
         begun: list[tuple[Candidate, CandidateSearch, list[ContactFit]]] = []
         for candidate in tried:
             self._stop()
             search = CandidateSearch(rough, candidate)
-            starts = [np.concatenate([s, np.zeros(2)]) for s in candidate.starts]
+            starts = [np.concatenate([s, np.zeros(COMMON)]) for s in candidate.starts]
             ends = sorted(search.try_all(starts), key=lambda f: f.cost)
             if abs(self._common[1]) > OTHER_GROUND:
-                moved = [np.concatenate([e.free[:-2], self._common]) for e in ends[:DESCENTS]]
+                moved = [np.concatenate([e.free[:-COMMON], self._common]) for e in ends[:DESCENTS]]
                 ends = sorted(ends + search.try_all(moved), key=lambda f: f.cost)
             begun.append((candidate, search, ends))
         # Most promising first, in case the budget ends.
@@ -201,16 +225,50 @@ class Survey:
             if rank == 0:
                 # The best one is always refined: report and predictions depend on it.
                 fit = search.descend(fit, LAST_ROUNDS, self._leave)
-                away = fit.free - end.free
+                away = self._away(end, fit)
             elif rank < FULL_SEARCHES and not self._late(0.6):
                 fit = search.descend(fit, FINE_ROUNDS, self._stop)
-                away = fit.free - end.free
+                away = self._away(end, fit)
             else:
                 if rank < FULL_SEARCHES:
                     self._work.skip((*self._names, candidate.name), "refined on the fine lattice")
                 fit = dataclasses.replace(fit, jacobians=end.jacobians)
             self._report(50 + 30 * (rank + 1) // len(found), candidate.name)
             out.append(FoundFit(search=search, fit=fit, moved=away))
+        return self._begun_weakly(out, without)
+
+    def _away(self, coarse: ContactFit, fine: ContactFit) -> Array:
+        """Return ``FoundFit.moved``, by Roache's grid convergence index (J. Fluids Eng. 116, 1994)."""
+        return 1.25 * self._extrapolated * (fine.free - coarse.free)
+
+    def _begun_weakly(self, found: list[FoundFit], without: ContactFit) -> list[FoundFit]:
+        """Return ``found``, all but the best searched again on the fine lattice from where they hardly act.
+
+        A coarse lattice may lead to a minimum that the fine one does not have, and effects that are small are near
+        the fit ``without`` them. What the linear model promises there decides which are followed.
+        """
+        best = max(found, key=self.evidence, default=None)
+        if best is None or not without.jacobians or self._late(0.6):
+            return found
+        common = [j[:, -COMMON:] for j in without.jacobians]
+        begun: list[tuple[float, int, ContactFit]] = []
+        for i, entry in enumerate(found):
+            candidate, search = entry.search.candidate, entry.search
+            if entry is best or candidate is None:
+                continue
+            self._stop()
+            starts = [np.concatenate([w, without.free[-COMMON:]]) for w in candidate.weak]
+            weak = min(search.try_all(starts), key=lambda f: f.cost)
+            weak = search.with_jacobians(weak, common) if weak.cost < LOST else weak
+            begun.append((0.5 * (entry.fit.cost - weak.cost) + search.promised(weak), i, weak))
+        begun.sort(key=lambda b: -b[0])
+        out = list(found)
+        for rank, (promised, i, weak) in enumerate(begun):
+            search = found[i].search
+            if promised > PROMISING and rank < FULL_SEARCHES and not self._late(0.7):
+                weak = search.descend(weak, LAST_ROUNDS, self._stop, fresh=False)
+            if weak.cost < out[i].fit.cost:
+                out[i] = dataclasses.replace(found[i], fit=weak, moved=None)
         return out
 
     def _pairs(self, tried: list[Candidate]) -> list[FoundFit]:
@@ -227,12 +285,14 @@ class Survey:
         assert best.search.candidate is not None and best.in_flight is not None
         values = best.search.candidate.values(best.in_flight.free)
         base = best.search.candidate.world(self.base, best.in_flight.free)
-        windows, size = self.problem.windows, self._size
-        problem = ContactProblem(self.flights, windows, base, model_error=self.problem.model_error, size=size)
-        rough = ContactProblem(self._coarse, windows, base, model_error=self._rough.model_error, size=size)
+        problem, rough = (dataclasses.replace(p, base=base) for p in (self.problem, self._rough))
         before = ((best.search.candidate.name, values, best.in_flight),)
         self._names = best.effects
-        return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, rough, tried)]
+        own = best.fit.jacobians
+        without = dataclasses.replace(
+            best.fit, free=best.fit.free[-COMMON:], jacobians=None if own is None else [j[:, -COMMON:] for j in own]
+        )
+        return [dataclasses.replace(f, before=before) for f in self._contact_effects(problem, rough, tried, without)]
 
     # Quality of a fit
 
@@ -284,16 +344,27 @@ class Survey:
             contact=start.time,
         )
 
-    def _measure_grain(self, windows: list[Window]) -> tuple[float, ModelError]:
-        """Return the distance in m between the motions of both lattices, and the model error it implies."""
+    def _measure_grain(self, windows: list[Window]) -> tuple[float, ModelError, float]:
+        """Return the distance in m between the motions of both lattices, and what it implies: the model error, and the
+        spread of the log modulus."""
         if not windows:
-            return 0.0, ModelError(drift=0.02, ringing=5e-4)
-        args = [w.trial for w in windows], [self.base] * len(windows), [w.times for w in windows]
-        fine, coarse = self.flights.motion(*args), self._coarse.motion(*args)
+            return 0.0, ModelError(drift=0.02, ringing=5e-4), LEAST_MODULUS
+        change = float(COMMON_STEP[2])
+        stiffer = dataclasses.replace(self.base, factor=self.base.factor * math.exp(change))
+        trials, times = [w.trial for w in windows], [w.times for w in windows]
+        both = self.flights.motion(trials * 2, [self.base] * len(times) + [stiffer] * len(times), times * 2)
+        fine, other = both[: len(times)], both[len(times) :]
+        coarse = self._coarse.motion(trials, [self.base] * len(times), times)
         apart = np.concatenate([((a - b) ** 2).sum(axis=2).ravel() for a, b in zip(fine, coarse, strict=True)])
         apart = apart[np.isfinite(apart)]
         rms = math.sqrt(float(apart.mean())) if len(apart) else 0.0
-        return rms, model_error_between(fine, coarse, [w.times - w.contact for w in windows], self._size)
+        since = [w.times - w.contact for w in windows]
+        spread = abs(modulus_between(fine, coarse, other, change)) * self._extrapolated
+        return (
+            rms,
+            model_error_between(fine, coarse, since, self._size, extrapolated=self._extrapolated),
+            min(max(spread, LEAST_MODULUS), MOST_MODULUS),
+        )
 
     def rough_motions(self, world: WorldParameters) -> list[Array]:
         """Return points (T, K, 3) of every fit trial under ``world`` on the coarse lattice."""

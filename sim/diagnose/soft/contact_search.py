@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fit of a candidate to the motion after first contact: whole simulations, Gauss-Newton, Laplace evidence.
-
-``ModelError`` is how far a correct model would still miss: camera noise, and the discretisation error after contact."""
+"""Fit of a candidate to the motion after first contact: whole simulations, Gauss-Newton, Laplace evidence."""
 
 from __future__ import annotations
 
@@ -15,108 +13,26 @@ from numpy.typing import NDArray
 
 from ..comparison_settings import SHARED
 from .flight_fits import FlightEstimate, Flights
+from .model_errors import LEVELS, ModelError, Whitened, log_prior_of_level, whiten
 from .soft_candidates import Candidate, WorldParameters
 
 Array = NDArray[np.float64]
 
-LEVELS = (0.35, 0.6, 1.0, 1.7, 2.9)
-"""Levels of model error, relative to the expected one, over which the evidence is summed."""
-
-LEVEL_SPREAD = 0.6
-"""Prior standard deviation of the log model error about the expected one."""
-
-
-DRIFT_SHARE, RINGING_SHARE = 0.8, 0.9
-"""Model error of the fine lattice over the difference between both lattices, calibrated on bodies of known motion."""
-
-LEAST_DRIFT, LEAST_RINGING = 0.006, 1e-4
-"""Lower bounds in m/s and m."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelError:
-    """Standard deviations of the model error after contact: drift in m/s, ringing in m."""
-
-    drift: float
-    ringing: float
-
-    def times(self, level: float) -> ModelError:
-        """Return the model error scaled by ``level``."""
-        return ModelError(drift=level * self.drift, ringing=level * self.ringing)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Whitened:
-    """Whitened trial: residuals over s, error modes over s, and the log determinant of the covariance."""
-
-    scale: Array
-    modes: Array
-    core: Array
-    log_det: float
-
-    def inner(self, a: Array, b: Array) -> Array:
-        """Return a^T C^-1 b of raw vectors (n,) or (n, m)."""
-        u, v = self._scaled(a), self._scaled(b)
-        return np.asarray(u.T @ v - (self.modes.T @ u).T @ np.linalg.solve(self.core, self.modes.T @ v))
-
-    def _scaled(self, a: Array) -> Array:
-        return np.asarray(a / (self.scale if a.ndim == 1 else self.scale[:, None]))
-
-
-def whiten(
-    points: Array, since: Array, seen: NDArray[np.bool_], *, noise: float, model_error: ModelError, size: float
-) -> Whitened:
-    """Return the covariance of coordinates ``seen`` (T, K) of ``points`` (T, K, 3), ``since`` (T,) s after contact."""
-    late = np.maximum(since, 0.0)
-    s = np.sqrt(noise**2 + (model_error.ringing * (late > 0)) ** 2)
-    scale = np.repeat(np.broadcast_to(s[:, None], seen.shape)[seen], 3)
-    modes = model_error.drift * modes_of(points, late, seen, size) / scale[:, None]
-    core = np.eye(6) + modes.T @ modes
-    log_det = 2 * float(np.log(scale).sum()) + float(np.linalg.slogdet(core)[1])
-    return Whitened(scale=scale, modes=modes, core=core, log_det=log_det)
-
-
-def modes_of(points: Array, late: Array, seen: NDArray[np.bool_], size: float) -> Array:
-    """Return error modes (n, 6): displacement of coordinates ``seen`` (T, K) per m/s of linear and angular drift."""
-    away = (points - points.mean(axis=1, keepdims=True)) / size
-    columns = []
-    for axis in np.eye(3):
-        columns.append(np.broadcast_to(late[:, None, None] * axis, points.shape)[seen].ravel())
-        columns.append((late[:, None, None] * np.cross(axis, away))[seen].ravel())
-    return np.stack(columns, axis=1)
-
-
-def model_error_between(fine: list[Array], coarse: list[Array], since: list[Array], size: float) -> ModelError:
-    """Return the model error from motions (T, K, 3) at two resolutions, ``since`` (T,) s after contact, by trial."""
-    drifts, rings = [], []
-    for a, b, t in zip(fine, coarse, since, strict=True):
-        seen = np.isfinite(a).all(axis=2) & np.isfinite(b).all(axis=2) & (t > 0)[:, None]
-        if seen.sum() < 4:
-            continue
-        modes, difference = modes_of(a, np.maximum(t, 0.0), seen, size), (a - b)[seen].ravel()
-        amounts = np.linalg.lstsq(modes, difference, rcond=None)[0]
-        drifts.append(float((amounts**2).mean()))
-        rings.append(float(((difference - modes @ amounts) ** 2).mean()))
-    if not drifts:
-        return ModelError(drift=0.02, ringing=5e-4)
-    return ModelError(
-        drift=max(LEAST_DRIFT, DRIFT_SHARE * math.sqrt(float(np.median(drifts)))),
-        ringing=max(LEAST_RINGING, RINGING_SHARE * math.sqrt(float(np.median(rings)))),
-    )
-
-
-def log_prior_of_level(level: float) -> float:
-    """Return the log prior of one of ``LEVELS``."""
-    weights = [math.exp(-0.5 * (math.log(x) / LEVEL_SPREAD) ** 2) for x in LEVELS]
-    return -0.5 * (math.log(level) / LEVEL_SPREAD) ** 2 - math.log(sum(weights))
-
-
 FRICTION_SPREAD, CONTACT_SPREAD = 0.05, 0.4
-FRICTION_REACH, CONTACT_REACH = 0.3, 1.8
-"""Bounds of both logarithms. A clearly different friction is a cause and must not hide here; the ground stiffness is
+"""Spreads of the logarithms of friction and contact stiffness."""
+
+COMMON = 3
+"""Free numbers that all candidates share: the logarithms of friction, contact stiffness and Young's modulus relative to
+the nominal ones. The modulus may differ by as much as a lattice makes the body too stiff."""
+
+REACH = np.array([0.3, 3.0, 0.2])
+"""Their bounds. A clearly different friction or modulus is a cause and must not hide here; the ground stiffness is
 unknown."""
 
-COMMON_STEP = np.array([0.06, 0.1])
+LEAST_MODULUS, MOST_MODULUS = 0.002, 0.1
+"""Bounds of the spread of the log modulus."""
+
+COMMON_STEP = np.array([0.06, 0.1, 0.02])
 LOST = 1e12
 """Cost of a failed simulation."""
 
@@ -136,9 +52,9 @@ class Window:
 class ContactFit:
     """A candidate's parameters after the search.
 
-    free: own parameters, then log friction and log contact stiffness relative to the nominal ones. laws: the resulting
+    free: own parameters, then the ``COMMON`` ones. laws: the resulting
     world parameters. cost: minus twice the log posterior, up to constants, under the expected model error. residuals:
-    per trial, (n,) raw, m. jacobians: per trial, (n, p + 2) of the simulated coordinates, or None if never computed.
+    per trial, (n,) raw, m. jacobians: per trial, (n, p + 3) of the simulated coordinates, or None if never computed.
     motions: simulated points.
     """
 
@@ -150,28 +66,35 @@ class ContactFit:
     motions: list[Array]
 
 
+@dataclass(frozen=True, kw_only=True)
 class ContactProblem:
-    """Windows of all fit trials and the residuals of simulations. grain: expected model error; size: of the body, m."""
+    """Windows of all fit trials and the residuals of simulations.
 
-    def __init__(
-        self,
-        flights: Flights,
-        windows: Sequence[Window],
-        base: WorldParameters,
-        *,
-        model_error: ModelError,
-        size: float,
-    ) -> None:
-        self.flights, self.windows, self.base = flights, list(windows), base
-        self.model_error, self.size = model_error, size
-        self.simulated = 0
+    model_error: expected; modulus_spread: of the log modulus, by which the lattice is too stiff or too soft; size: of
+    the body, m.
+    """
+
+    flights: Flights
+    windows: Sequence[Window]
+    base: WorldParameters
+    model_error: ModelError
+    modulus_spread: float
+    size: float
+
+    def coarser(self, flights: Flights) -> ContactProblem:
+        """Return the same problem on the coarse lattice of ``flights``."""
+        return dataclasses.replace(
+            self,
+            flights=flights,
+            model_error=self.model_error.times(1.5),
+            modulus_spread=1.5 * self.modulus_spread,
+        )
 
     def motions(self, world: Sequence[WorldParameters]) -> list[list[Array]]:
         """Return the simulated points of every window under each of ``world``."""
         trials = [w.trial for _ in world for w in self.windows]
         times = [w.times for _ in world for w in self.windows]
         found = self.flights.motion(trials, [a for a in world for _ in self.windows], times)
-        self.simulated += len(found)
         n = len(self.windows)
         return [found[i * n : (i + 1) * n] for i in range(len(world))]
 
@@ -191,10 +114,16 @@ class ContactProblem:
         )
 
 
-def common_laws(world: WorldParameters, base: WorldParameters, common: Array, *, friction: bool) -> WorldParameters:
-    """Return ``world`` with log friction (unless the candidate sets it) and log contact relative to ``base``."""
-    rubbing = base.friction * math.exp(common[0]) if friction else world.friction
-    return dataclasses.replace(world, friction=rubbing, contact=base.contact * math.exp(common[1]))
+def common_laws(
+    world: WorldParameters, base: WorldParameters, common: Array, moves: NDArray[np.bool_]
+) -> WorldParameters:
+    """Return ``world`` with the ``COMMON`` numbers relative to ``base``, but those that the candidate sets."""
+    return dataclasses.replace(
+        world,
+        friction=base.friction * math.exp(common[0]) if moves[0] else world.friction,
+        contact=base.contact * math.exp(common[1]),
+        factor=base.factor * math.exp(common[2]) if moves[2] else world.factor,
+    )
 
 
 class CandidateSearch:
@@ -206,18 +135,19 @@ class CandidateSearch:
         self.problem, self.candidate, self.in_flight = problem, candidate, in_flight
         own = 0 if candidate is None else len(candidate.mean)
         self.own = own
-        common = np.array([FRICTION_SPREAD, CONTACT_SPREAD])
-        self.mean = np.concatenate([[] if candidate is None else candidate.mean, np.zeros(2)])
+        common = np.array([FRICTION_SPREAD, CONTACT_SPREAD, problem.modulus_spread])
+        self.mean = np.concatenate([[] if candidate is None else candidate.mean, np.zeros(COMMON)])
         self.spread = np.concatenate([[] if candidate is None else candidate.spread, common])
         self.step = np.concatenate([[] if candidate is None else candidate.step, COMMON_STEP])
-        self.moves = np.ones(own + 2, dtype=bool)
+        self.moves = np.ones(own + COMMON, dtype=bool)
         self.moves[own] = candidate is None or candidate.name != "friction"
+        self.moves[own + 2] = candidate is None or candidate.name != "stiffness"
 
     def world(self, free: Array) -> WorldParameters:
-        """Return the world parameters of ``free`` (p + 2,)."""
+        """Return the world parameters of ``free`` (p + 3,)."""
         base = self.problem.base
         own = base if self.candidate is None else self.candidate.world(base, free[: self.own])
-        return common_laws(own, base, free[self.own :], friction=bool(self.moves[self.own]))
+        return common_laws(own, base, free[self.own :], self.moves[self.own :])
 
     def prior(self, free: Array) -> tuple[float, Array, Array]:
         """Return -2 log of prior times flight likelihood (up to constants), minus half its gradient, curvature."""
@@ -252,25 +182,38 @@ class CandidateSearch:
         found = self.problem.motions([self.world(p) for p in points])
         return [self.judge(p, m) for p, m in zip(points, found, strict=True)]
 
-    def with_jacobians(self, fit: ContactFit) -> ContactFit:
-        """Return ``fit`` with finite-difference jacobians."""
-        moving = np.flatnonzero(self.moves)
+    def with_jacobians(self, fit: ContactFit, common: Sequence[Array] | None = None) -> ContactFit:
+        """Return ``fit`` with finite-difference jacobians. common: (n, 3) by trial of the ``COMMON`` ones, if known."""
+        moving = np.flatnonzero(self.moves[: self.own] if common is not None else self.moves)
         varied = [fit.free + self.step * (np.arange(len(fit.free)) == i) for i in moving]
         found = self.problem.motions([self.world(v) for v in varied])
         jacobians = []
         for k, window in enumerate(self.problem.windows):
             jacobian = np.zeros((len(fit.residuals[k]), len(fit.free)))
+            if common is not None:
+                jacobian[:, self.own :] = common[k] * self.moves[self.own :]
             for i, motions in zip(moving, found, strict=True):
                 column = (motions[k] - fit.motions[k])[window.seen].ravel() / self.step[i]
                 jacobian[:, i] = np.where(np.isfinite(column), column, 0.0)
             jacobians.append(jacobian)
         return dataclasses.replace(fit, jacobians=jacobians)
 
-    def descend(self, fit: ContactFit, rounds: int, stop: Callable[[], bool]) -> ContactFit:
-        """Return ``fit`` improved by up to ``rounds`` steps, with jacobians of its last or last but one iterate."""
+    def promised(self, fit: ContactFit) -> float:
+        """Return the nats that the linear model about ``fit``, which has jacobians, promises of a descent from it."""
+        if fit.cost >= LOST:
+            return 0.0
+        gradient, curvature = (a[self.moves] for a in self.normal_equations(fit))
+        return 0.5 * float(gradient @ np.linalg.solve(curvature[:, self.moves], gradient))
+
+    def descend(self, fit: ContactFit, rounds: int, stop: Callable[[], bool], *, fresh: bool = True) -> ContactFit:
+        """Return ``fit`` improved by up to ``rounds`` steps, with jacobians of its last or last but one iterate.
+
+        fresh: jacobians are computed first; else those of ``fit`` are used.
+        """
         if fit.cost >= LOST or stop():
             return fit
-        fit = self.with_jacobians(fit)
+        if fresh:
+            fit = self.with_jacobians(fit)
         for _ in range(rounds):
             if stop():
                 break
@@ -370,10 +313,9 @@ class CandidateSearch:
         return np.array(scores), residuals
 
     def covariance(self, fit: ContactFit, moved: Array | None = None) -> Array:
-        """Return the covariance (p + 2, p + 2) of the free parameters, for trials that share model errors.
+        """Return the covariance (p + 3, p + 3) of the free parameters, for trials that share model errors.
 
-        moved: (p + 2,) from the optimum on the coarse lattice to ``fit``, None if unknown. With 95 % a body without
-        cells is no farther (Roache's grid convergence index, J. Fluids Eng. 116, 1994: 1.25 / (1.5² - 1) of it).
+        moved: (p + 3,) by which, with 95 %, the optimum of a body without cells is farther, None if unknown.
         """
         if fit.jacobians is None or fit.cost >= LOST:
             return np.asarray(np.diag(self.spread**2))
@@ -391,6 +333,5 @@ class CandidateSearch:
         out = free.copy()
         if self.candidate is not None:
             out[: self.own] = np.clip(free[: self.own], self.candidate.low, self.candidate.high)
-        reach = np.array([FRICTION_REACH, CONTACT_REACH])
-        out[self.own :] = np.clip(free[self.own :], -reach, reach)
+        out[self.own :] = np.clip(free[self.own :], -REACH, REACH)
         return out

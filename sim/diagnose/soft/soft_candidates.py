@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,6 +154,8 @@ class Candidate:
 
     values: free parameters (p,) → the effect's parameters. mean, spread: (p,) of the Gaussian prior. step: (p,) for
     finite differences. starts: (S, p). low, high: (p,) bounds. choices: number of candidates of one name (axes).
+    weak: (W, p) where the effect hardly acts, from where it is searched again beside the model without it; W is 0 for
+    effects that flights show.
     """
 
     name: str
@@ -165,6 +167,7 @@ class Candidate:
     low: Array
     high: Array
     choices: int = 1
+    weak: Array
 
     def world(self, base: WorldParameters, free: Array) -> WorldParameters:
         """Return ``base`` with the effect."""
@@ -181,13 +184,27 @@ def _make(
     low: list[float],
     high: list[float],
     choices: int = 1,
+    *,
+    weak: Sequence[Sequence[float]] = (),
 ) -> Candidate:
     as_array = [np.asarray(a, dtype=np.float64) for a in (mean, spread, step, starts, low, high)]
     m, s, d, at, lo, hi = as_array
-    return Candidate(name=name, values=values, mean=m, spread=s, step=d, starts=at, low=lo, high=hi, choices=choices)
+    little = np.asarray(weak, dtype=np.float64).reshape(-1, len(m))
+    return Candidate(
+        name=name, values=values, mean=m, spread=s, step=d, starts=at, low=lo, high=hi, choices=choices, weak=little
+    )
 
 
-def _one(name: str, parameter: str, guess: float, spread: float, starts: list[float], *, most: float) -> Candidate:
+def _one(
+    name: str,
+    parameter: str,
+    guess: float,
+    spread: float,
+    starts: list[float],
+    *,
+    most: float,
+    weak: Sequence[float] = (),
+) -> Candidate:
     """Return a candidate with a single positive parameter, free in its logarithm."""
     return _make(
         name,
@@ -198,6 +215,7 @@ def _one(name: str, parameter: str, guess: float, spread: float, starts: list[fl
         [[math.log(x)] for x in starts],
         [math.log(guess) - 8],
         [math.log(most)],
+        weak=[[math.log(x)] for x in weak],
     )
 
 
@@ -208,14 +226,26 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
     """
     e, mu = base.modulus, base.friction
     pairs: Mapping[str, tuple[Candidate, ...]] = {
-        "stiffness": (_one("stiffness", "factor", 1.0, 0.8, STIFFNESSES, most=12.0),),
-        "internal_damping": (_one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4], most=2e-3),),
+        "stiffness": (_one("stiffness", "factor", 1.0, 0.8, STIFFNESSES, most=12.0, weak=[1.0]),),
+        "internal_damping": (
+            _one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4], most=2e-3, weak=[5e-5]),
+        ),
         "plastic_yield": (
-            _one("plastic_yield", "yield_stress", 0.15 * e, 0.8, [0.05 * e, 0.1 * e, 0.2 * e, 0.4 * e], most=3 * e),
+            _one(
+                "plastic_yield",
+                "yield_stress",
+                0.15 * e,
+                0.8,
+                [0.05 * e, 0.1 * e, 0.2 * e, 0.4 * e],
+                most=3 * e,
+                weak=[0.25 * e, 0.5 * e],
+            ),
         ),
         "anisotropy": tuple(_fibres(e, axis) for axis in np.eye(3)),
         "stiffness_gradient": (_gradient(),),
-        "friction": (_one("friction", "friction", max(mu, 0.02), 0.8, [0.4 * mu + 0.01, 1.8 * mu + 0.02], most=5.0),),
+        "friction": (
+            _one("friction", "friction", max(mu, 0.02), 0.8, [0.4 * mu + 0.01, 1.8 * mu + 0.02], most=5.0, weak=[mu]),
+        ),
         "adhesion": (
             _make(
                 "adhesion",
@@ -226,6 +256,7 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
                 [[math.log(40.0), math.log(5e-3)], [math.log(150.0), math.log(5e-3)]],
                 [-3.0, math.log(5e-4)],
                 [7.0, math.log(0.05)],
+                weak=[[math.log(10.0), math.log(5e-3)]],
             ),
         ),
         "air_drag": (_one("air_drag", "drag_per_mass", 0.1, 1.2, [0.1], most=20.0),),
@@ -287,6 +318,7 @@ def _fibres(modulus: float, axis: Array) -> Candidate:
         [math.log(1e-3 * modulus)],
         [math.log(20 * modulus)],
         choices=3,
+        weak=[[math.log(0.1 * modulus)]],
     )
 
 
@@ -298,7 +330,17 @@ def _gradient() -> Candidate:
         return {"slope": min(q, 0.95), **dict(zip(names, (float(a) for a in d), strict=True))}
 
     starts = [list(sign * 0.45 * axis) for axis in np.eye(3) for sign in (1, -1)]
-    return _make("stiffness_gradient", values, [0.0] * 3, [0.4] * 3, [0.04] * 3, starts, [-0.95] * 3, [0.95] * 3)
+    return _make(
+        "stiffness_gradient",
+        values,
+        [0.0] * 3,
+        [0.4] * 3,
+        [0.04] * 3,
+        starts,
+        [-0.95] * 3,
+        [0.95] * 3,
+        weak=[[0.0] * 3],
+    )
 
 
 def _tether(middle: Array, string: float) -> Candidate:

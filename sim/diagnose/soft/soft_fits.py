@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...events import IsCancelled, OnEvent
 from ..capture import Capture
+from ..comparison_settings import ComparisonSettings
 from ..diagnosis import DIRECTIONS, CandidateFit, Discrepancy, Estimate, PhaseInterval
 from ..work import Work
 from .candidate_survey import FoundFit, Survey
@@ -235,6 +236,7 @@ class SoftFits:
             rms = self._rms(trials, self._whole_trials([fit.world])[0])
         if rms is None:
             rms = self._whole_nominal * self._window_rms(residuals) / max(self._windows_nominal, 1e-12)
+        landed, flying = self._survey.contact_misfit(found), self._survey.flight_misfit(found)
         result = CandidateFit(
             effects=found.effects,
             parameters=parameters,
@@ -242,7 +244,8 @@ class SoftFits:
             log_evidence=self._survey.evidence(found),
             heldout_log_score=by_trial,
             heldout_rms_m=rms,
-            misfit=max(self._survey.contact_misfit(found), self._survey.flight_misfit(found)),
+            misfit=max(landed, flying),
+            limit=self._survey.limit * max(1.0, flying) if landed > flying else ComparisonSettings.enough,
         )
         self._found[id(result)], self._laws[id(result)] = found, fit.world
         return result
