@@ -11,6 +11,7 @@ from physgen.sim.reconstruct.background.background_inpainting import fill_backgr
 from physgen.sim.reconstruct.background.unboxed_things import unboxed_things
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.lighting.shadow_masks import cast_shadows, object_holes
+from scipy import ndimage
 
 WIDTH, HEIGHT = 240, 180
 CAMERA = camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(50.0))
@@ -166,3 +167,20 @@ def test_a_thing_on_the_border_of_the_range_stays_whole():
     picture[thing], picture[far] = (200.0, 60.0, 40.0), (40.0, 45.0, 120.0)
     found = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], CAMERA)
     assert (found.stay & far).sum() > 0.9 * far.sum()
+
+
+def test_silver_coins_on_white_that_touch_stay_each():
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[:300, :400] + 0.5
+    pixels = np.full((300, 400, 3), 244.0)
+    discs = [np.hypot(columns - x, rows - y) < 37 for y in (70, 146) for x in (60, 135, 210, 285)]
+    for mask in discs:
+        pixels[mask] = 225 + 25 * np.sign(np.sin(0.5 * columns[mask]))[:, None]
+        pixels[mask & ~ndimage.binary_erosion(mask, iterations=3)] = 120
+    pixels = ndimage.gaussian_filter(pixels + rng.normal(scale=2, size=pixels.shape), (0.7, 0.7, 0))
+    view = camera_above_ground(400, 300, 400.0, np.radians(80))
+    found = unboxed_things(np.clip(pixels, 0, 255).astype(np.uint8), [discs[1]], view)
+    for mask in discs[:1] + discs[2:]:
+        # Circles are found on a grid of 1.5 pixels: a sickle of that width is 4 % of the coin.
+        assert min((found.stay & mask).sum(), (found.whole & mask).sum()) > 0.95 * mask.sum()
+    assert not (found.stay & discs[1]).any()

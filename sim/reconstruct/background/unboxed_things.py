@@ -21,6 +21,7 @@ from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
 from ..lighting.ground_pixels import LUMINANCE
+from ..segmentation.round_things import circles_of_a_kind
 from .texture_prediction import predict_texture
 
 Mask = NDArray[np.bool_]
@@ -56,6 +57,10 @@ SHADE_TINT = 0.2
 black."""
 ON_GROUND = 0.25
 """Share of a row of the range that is ground, from which what stands in that row may stand before more of it."""
+RIM, BOXED = 1.05, 0.3
+"""Radius of a round thing of many over that of the circle that was found, which may be its rim's inner edge; and share
+of it that is an object's from which it is that object.
+"""
 HIDDEN = 0.1
 """Share of a thing's outline along an object above which the thing continues behind it."""
 
@@ -85,7 +90,24 @@ def unboxed_things(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Cam
     for mask in masks:
         if mask.any():
             _look_around(pixels, mask, objects, camera, stay, whole)
+    if objects.any():
+        alike = _alike(pixels, objects)
+        stay |= alike
+        whole |= alike
     return UnboxedThings(stay=stay & ~objects, whole=whole & ~objects)
+
+
+def _alike(pixels: NDArray[np.uint8], objects: Mask) -> Mask:
+    """Pixels (H, W) of the round things of a photo of many that are none of the ``objects`` (H, W). They touch, and
+    silver on white hardly differs from the ground."""
+    rows, columns = np.mgrid[: objects.shape[0], : objects.shape[1]] + 0.5
+    result = np.zeros_like(objects)
+    for item in circles_of_a_kind(pixels):
+        away = np.hypot(columns - item.x, rows - item.y)
+        inner = away < item.radius
+        if float((inner & objects).sum()) < BOXED * float(inner.sum()):
+            result |= away < RIM * item.radius
+    return result
 
 
 def _look_around(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: Camera, stay: Mask, whole: Mask) -> None:
