@@ -196,6 +196,8 @@ CERTAIN = 0.985
 """Overlap that no wrong shape reaches: nothing else is tried."""
 SIMPLER = {"sphere": 0.0, "cylinder": 0.006, "box": 0.012}
 """Overlap that a shape with more parameters has to gain."""
+FREE_HEIGHT = 0.02
+"""Overlap that a ball may have over a disc of one proportion, as its height over width is free."""
 OF_KIND = 0.85
 """Overlap without handles that a primitive by kind needs."""
 ROUND = (0.8, 1.25)
@@ -313,11 +315,16 @@ class _Candidates:
 
     def lying(self, found: PrimitiveChoice | None) -> PrimitiveChoice | None:
         """Return ``found``, or a disc that lies on the ground if it is a ball seen from above that looks flat."""
-        ball = found is not None and isinstance(found.primitive, Sphere)
-        if not ball or self._pixels is None or not looks_down(self._camera):
+        if found is None or not isinstance(found.primitive, Sphere):
+            return found
+        if self._pixels is None or not looks_down(self._camera):
             return found
         flat = self._judged(fit_disc(self._camera, self._outline))
-        if flat is None or flat.overlap < CLEAR or not is_disc(self._pixels, self._full & self._seen):
+        if (
+            flat is None
+            or flat.overlap < found.overlap - FREE_HEIGHT
+            or not is_disc(self._pixels, self._full & self._seen)
+        ):
             return found
         return flat
 
