@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..events import IsCancelled
 from .block_lists import BlockLists, block_keys, bytes_of
+from .implicit import ImplicitSteps, Matter, StepReport
 from .kernels import layout, parallel_sorting, runtime, sorting, time_stepping
 from .kernels.constitutive_response import law_set
 from .kernels.kernel_arrays import (
@@ -118,6 +119,7 @@ class Engine:
         self._thin = several and numbers.thin
         self.count = 0
         self.retries = 0
+        self._implicit: ImplicitSteps | None = None
         self._table = upload_new(numbers.table)
         self._world_integers = upload_new(numbers.world_integers)
         self._world_numbers = upload_new(numbers.worlds)
@@ -404,6 +406,42 @@ class Engine:
             recovered = np.minimum(1.0, RECOVER * control[:, layout.CFL_SCALE])
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
         self._put_control(control)
+
+    def add_elapsed(self, seconds: float) -> None:
+        """Count ``seconds`` before the last ``advance``, which diverged, among those that have passed."""
+        control = self.control()
+        control[:, layout.ELAPSED] += seconds
+        self._put_control(control)
+
+    @property
+    def bodies_meet(self) -> bool:
+        """Whether particles of several bodies share nodes."""
+        return self._several and self._blocks.any_overlap
+
+    def begin_implicit(self) -> None:
+        """Make the particles ready for implicit steps."""
+        control = self.control()
+        control[:, layout.STATUS] = layout.WANTS_SORT
+        self._put_control(control)
+        self._sort()
+        control[:, layout.STATUS] = layout.DONE
+        self._put_control(control)
+
+    def implicit_step(self, dt: float, gravity: Array, most_hit: float) -> StepReport:
+        """An implicit step of the only world, see ``ImplicitSteps.step``."""
+        if self._implicit is None:
+            self._implicit = ImplicitSteps(self.laws)
+        blocks = self._blocks
+        matter = Matter(
+            self._worlds(), blocks.particle_blocks, blocks.grid_blocks, self._particle_bundle(), blocks.nodes
+        )
+        control = self.control()
+        report = self._implicit.step(dt, gravity, most_hit, float(control[0, layout.WAVE_SPEED]), matter)
+        if report.done:
+            control[0, layout.SPEED] = report.speed
+            control[0, layout.SUBSTEPS] += 1.0
+            self._put_control(control)
+        return report
 
     def _expected_launches(self, control: Array) -> int:
         """Launches, at least 1, that pass at this state before the first world can want a sort or have come to its

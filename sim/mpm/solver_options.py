@@ -40,6 +40,10 @@ class SolverOptions:
     """Longest substep in seconds, whatever the wave speed; above 0. After a fall of time t the position is wrong by
     max_step / t of the way."""
 
+    implicit: bool = False
+    """Whether stiff elastic matter takes implicit steps while it flies, slides or rests, where they pay; see
+    ``quiet_matter``. Of a single world on a CPU."""
+
     arch: str = "cpu"
     """Where to compute: "cpu", "cuda", "vulkan" or "metal"; falls back to "cpu" where it is not available."""
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 
@@ -22,6 +23,7 @@ from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, u
 from .kernels import layout, runtime
 from .kernels.lanes import lanes_of, windows_of
 from .kernels.time_stepping import RIGID_LOST
+from .quiet_matter import QuietMatter, why_explicit
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
 from .solver_options import SolverOptions
@@ -29,6 +31,8 @@ from .world_setup import WorldSetup, check_start
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
+
+logger = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 2
 
@@ -92,6 +96,7 @@ class WorldGroup:
         self._fits: dict[int, FittedGradients] = {}
         self._followed: dict[int, DeformableMaterial] = {}
         self._shares: dict[int, ti.Ndarray] = {}
+        self._quiet_matter = self._new_quiet_matter()
         self._reach_times(np.full(len(self), -math.inf))
 
     def _new_rigid_bodies(self) -> RigidBodies:
@@ -116,6 +121,18 @@ class WorldGroup:
             windows=windows_of(self.arch, self.options.threads),
         )
 
+    def _new_quiet_matter(self) -> QuietMatter | None:
+        """What chooses implicit steps, where they are asked for and possible; a line in the log says why not."""
+        if not self.options.implicit:
+            return None
+        reason = why_explicit(self.setups[0]) if len(self) == 1 else "there are several worlds"
+        if self.arch != "cpu":
+            reason = f"{self.arch} computes"
+        if reason is not None:
+            logger.info("explicit steps only: %s", reason)
+            return None
+        return QuietMatter(self._places[0], self._offsets)
+
     def __len__(self) -> int:
         return len(self.setups)
 
@@ -132,6 +149,12 @@ class WorldGroup:
     def stable_step(self, world: int) -> float:
         """Longest substep in s that the present state of world ``world`` allows."""
         return min(float(self._engine.stable_steps()[world]), self._longest_step(self._places[world]))
+
+    def particle_passes(self, world: int) -> int:
+        """Passes over the particles of world ``world`` so far: one an explicit substep."""
+        substeps = int(self.control(world)[layout.SUBSTEPS])
+        quiet = self._quiet_matter
+        return substeps if quiet is None else substeps - quiet.steps + quiet.passes
 
     @property
     def device_bytes(self) -> int:
@@ -169,7 +192,7 @@ class WorldGroup:
             longest = [self._longest_step(place) for place in self._places]
             self._host = None
             try:
-                self._engine.advance(stops - self._times, longest_step=np.array(longest), stop=stop)
+                self._advance_matter(stops - self._times, np.array(longest), stop)
             except Stopped:
                 self._between = True
                 raise Cancelled("the simulation was stopped in the middle of a step") from None
@@ -179,6 +202,15 @@ class WorldGroup:
             before = self._times.copy()
             self._times = stops
             self._reach_times(before)
+
+    def _advance_matter(self, durations: Array, longest: Array, stop: IsCancelled) -> None:
+        """Advance the engine, in implicit steps where those are asked for and pay."""
+        if self._quiet_matter is None or not durations[0] > 0:
+            self._engine.advance(durations, longest_step=longest, stop=stop)
+            return
+        row = packing.world_row(self._places[0], float(self._times[0]), float(self._times[0]))
+        recovery = float(row[layout.RECOVERY_SPEED])
+        self._quiet_matter.advance(self._engine, float(durations[0]), float(longest[0]), stop, recovery)
 
     def _longest_step(self, place: packing.WorldSlot) -> float:
         """Longest substep in s apart from waves: the option's, and that of springs."""

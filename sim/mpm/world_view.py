@@ -50,6 +50,11 @@ class WorldView:
         return int(self.group.control(self.index)[layout.SUBSTEPS])
 
     @property
+    def particle_passes(self) -> int:
+        """Passes over the particles since the world was made: one an explicit substep, several an implicit step."""
+        return self.group.particle_passes(self.index)
+
+    @property
     def stable_step(self) -> float:
         """Longest substep in s that the present state allows."""
         return self.group.stable_step(self.index)

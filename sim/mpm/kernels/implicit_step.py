@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: MIT
+# ruff: noqa: ANN201, ANN202, SIM102
+# mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
+# (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
+"""What an implicit step asks of the particles: momentum, forces at the end of the step, their stiffness; and its end.
+
+Unknown are the displacements u of the nodes over the step (cells); ``implicit`` solves for them. With the gradient H
+that they have at a particle, d = x_i - x_p, weights w and the Kirchhoff stress tau (times the volume at rest) of
+F' = H F at the end of the step (backward Euler, as Stomakhin et al. 2013 and Gast et al. 2015):
+
+    H = 1 + 4 sum_i w_ip u_i d^T          f_i = - sum_p 4 w_ip tau_p(H F) H^-T d
+    K: stiffness of f, taken as that of isotropic matter of small strain, hence symmetric and positive definite
+
+The ground pushes particles by springs, as stiff as half a cell of the matter, that start from the contact forces of
+the step before, so that what rests stays where it is; friction is a spring along the ground that yields at Coulomb's
+limit.
+
+Kernels of a CPU: a thread takes a block and its window, as in ``particle_transfer``.
+"""
+
+import functools
+from typing import NamedTuple
+
+import taichi as ti
+
+from ...constitutive import ROW
+from .constitutive_response import RELAXATION_TIME, RELAXING_SHARE, law_set, own_numbers
+from .kernel_arrays import GridBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
+from .kernel_bundles import BundledKernel, func, kernel
+from .lanes import SERIAL
+from .layout import (
+    FIELD_INTEGERS,
+    FIRST_TOUCH,
+    FIXED_HIGH,
+    FIXED_LOW,
+    FIXED_ONE,
+    HAS_PLANE,
+    PLANE_NORMAL,
+    PLANE_OFFSET,
+    SLIDING,
+    SPREAD,
+    STICKING,
+    TOUCH_ROW,
+    WINDOW_NODES,
+    Scalars,
+    Vectors4,
+    ivec3,
+    mat3,
+    triple,
+    vec3,
+    vec4,
+)
+from .windows import add_to, clear_window, first_of, interpolate, load_window, spread, sum_windows, turns, weights
+
+CONTACT_STIFFNESS = 4.0
+"""Stiffness of the spring between a particle and the ground over (2 mu + lambda) V0, per cell²: of a particle's share
+of the surface, a quarter of a cell², half a cell of the matter has this."""
+
+FREE = -1.0
+"""State of a particle that the ground does not push; of one that it pushes, the share of the spring along the ground
+that friction bears, 1 where it sticks."""
+
+HIT, PRESSED, FASTEST, FARTHEST = range(4)
+"""Numbers that a block reports: largest speed (cells/s) at which a particle that did not touch reaches the ground, sum
+of the forces on the ground (kg cells/s²); largest |v|² (cells²/s²) and largest displacement (cells) of a particle."""
+
+REPORT = 4
+
+
+CLOSE = 1e-4
+"""Cells from the ground within which a particle counts as touching it for the solver, which else would let what stands
+on it fall first."""
+
+YIELDING = 0.5
+"""Share of the secant stiffness of friction that slides which the solver counts with: with all of it, as iteratively
+reweighted least squares have it, no step overshoots, but they are slow; half is the least that is stable."""
+
+
+class ImplicitArrays(NamedTuple):
+    """Values at nodes and particles of an implicit step. G grid blocks, P particle blocks, N particles."""
+
+    given: Vectors4
+    """(G, BLOCK_NODES) what a kernel reads at the nodes."""
+
+    motion: Vectors4
+    """(G, BLOCK_NODES) velocities at the end of the step, cells/s."""
+
+    found: Vectors4
+    """(G, BLOCK_NODES) what a kernel sums up at the nodes."""
+
+    contact: Vectors4
+    """(N,) force of the ground on a particle at the end of the step (kg cells/s²), and the state of the contact."""
+
+    report: Scalars
+    """(P, REPORT)"""
+
+
+@ti.func
+def place_of(x: ivec3):
+    """Place in its window of a particle at ``x`` in fixed point, lowest node, place from there."""
+    here = ti.cast(x, ti.f32) * (1.0 / FIXED_ONE)
+    base = ti.cast(here - 0.5, ti.i32)
+    return here, base, here - ti.cast(base, ti.f32)
+
+
+@ti.func
+def value_and_gradient(first: ti.i32, fx: vec3, window: ti.template()):
+    """Value (3) and gradient (3, 3) of the window's numbers at ``fx`` from its node ``first``."""
+    A, B0, B1, B2 = interpolate(first, fx, window)
+    gradient = mat3(0.0)
+    for r in ti.static(range(3)):
+        gradient[r, 0] = 4.0 * B0[r]
+        gradient[r, 1] = 4.0 * B1[r]
+        gradient[r, 2] = 4.0 * B2[r]
+    return vec3(A[0], A[1], A[2]), gradient
+
+
+@ti.func
+def spread_linear(first: ti.i32, fx: vec3, value: vec3, slopes: mat3, mass: ti.f32, window: ti.template()):
+    """Add value + slopes (x_i - x_p), and ``mass`` as fourth number, to the nodes, times their weights."""
+    b = value - slopes @ fx
+    c0 = vec4(slopes[0, 0], slopes[1, 0], slopes[2, 0], 0.0)
+    c1 = vec4(slopes[0, 1], slopes[1, 1], slopes[2, 1], 0.0)
+    c2 = vec4(slopes[0, 2], slopes[1, 2], slopes[2, 2], 0.0)
+    spread(first, fx, vec4(b[0], b[1], b[2], mass), c0, c1, c2, window)
+
+
+@func
+def sum_nodes(grid: GridBlocks, nodes: NodeArrays, arrays: ImplicitArrays):
+    """``found`` from the windows of the particle blocks."""
+    for gg in range(grid.count * SPREAD):
+        if gg % SPREAD == 0:
+            sum_windows(gg // SPREAD, grid.neighbours, nodes.scattered, arrays.found)
+
+
+@kernel
+def gather_momentum(
+    blocks: ParticleBlocks, grid: GridBlocks, particles: ParticleArrays, nodes: NodeArrays, arrays: ImplicitArrays
+):
+    """Momentum (kg cells/s) and mass (kg) of the nodes."""
+    for kk in range(blocks.count * SPREAD):
+        if kk % SPREAD == 0:
+            k = kk // SPREAD
+            offset = k * WINDOW_NODES
+            clear_window(SERIAL, 0, offset, nodes.scattered)
+            for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                _, base, fx = place_of(particles.x[p])
+                m = particles.constants[p][0]
+                first = offset + first_of(base, nodes.scattered)
+                spread_linear(first, fx, m * particles.v[p], m * particles.C[p], m, nodes.scattered)
+    sum_nodes(grid, nodes, arrays)
+
+
+@func
+def ground_of(k: ti.i32, worlds: WorldArrays, blocks: ParticleBlocks):
+    """Normal of the ground, and its distance (cells) from the origin of block ``k``'s window; far if there is none."""
+    normal = triple(worlds.numbers, PLANE_NORMAL)
+    level = normal.dot(ti.cast(blocks.cells[k] * 4 - 1, ti.f32)) - worlds.numbers[PLANE_OFFSET]
+    if worlds.numbers[HAS_PLANE] < 0.5:
+        level = 1e9
+    return normal, level
+
+
+@func
+def pushed(
+    p: ti.i32, touch: ti.i32, gap: ti.f32, normal: vec3, shift: vec3, worlds: WorldArrays, particles: ParticleArrays
+):
+    """Force of the ground (kg cells/s²) on particle ``p``, ``gap`` cells away before it moves by ``shift``, and the
+    state of the contact."""
+    fixed = particles.constants[p]
+    past = particles.reaction[p]
+    before = fixed[0] * vec3(past[0], past[1], past[2])
+    stiffness = CONTACT_STIFFNESS * (fixed[1] + fixed[2])
+    along = shift.dot(normal)
+    pressed = before.dot(normal)
+    # A contact goes on from where it is; a new one begins at the ground.
+    moved = along
+    if pressed <= 0.0:
+        moved += ti.max(gap, 0.0)
+    trial = pressed - stiffness * moved
+    pressing = ti.max(0.0, trial)
+    force = pressing * normal
+    state = FREE
+    if trial > -CLOSE * stiffness:
+        state = 1.0
+        rubbing = before - pressed * normal - stiffness * (shift - along * normal)
+        size = rubbing.norm()
+        if size > 0.0 and size > worlds.contacts[touch + STICKING] * pressing:
+            share = worlds.contacts[touch + SLIDING] * pressing / size
+            rubbing *= share
+            state = YIELDING * share
+        force += rubbing
+    return force, state
+
+
+@functools.cache
+def find_forces_of(laws: int) -> BundledKernel:
+    """Kernel of the forces at the end of a step for the set ``laws`` of constitutive models."""
+    models = law_set(laws)
+
+    @kernel
+    def find_forces(
+        dt: ti.f32,
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        arrays: ImplicitArrays,
+    ):
+        """Forces (kg cells/s²) on the nodes after the displacements ``given``, with those of the ground, which are
+        kept in ``contact``."""
+        for kk in range(turns(SERIAL, blocks.count, nodes.window) * SPREAD):
+            if kk % SPREAD == 0:
+                turn, all_turns = kk // SPREAD, turns(SERIAL, blocks.count, nodes.window)
+                spot = turn * WINDOW_NODES
+                for k in range(turn * blocks.count // all_turns, (turn + 1) * blocks.count // all_turns):
+                    load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
+                    offset = k * WINDOW_NODES
+                    clear_window(SERIAL, 0, offset, nodes.scattered)
+                    normal, level = ground_of(k, worlds, blocks)
+                    touch = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH] * TOUCH_ROW
+                    hit, sum_pressed = 0.0, 0.0
+                    for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                        here, base, fx = place_of(particles.x[p])
+                        window_node = first_of(base, nodes.window)
+                        fixed = particles.constants[p]
+                        shift, H = value_and_gradient(spot + window_node, fx, nodes.window)
+                        for r in ti.static(range(3)):
+                            H[r, r] += 1.0
+                        tau = stress_after(models, p, dt, H, worlds, particles)
+                        force = vec3(0.0)
+                        state = FREE
+                        gap = level + normal.dot(here) - fixed[3]
+                        if gap < 2.0:
+                            past = particles.reaction[p]
+                            force, state = pushed(p, touch, gap, normal, shift, worlds, particles)
+                            sum_pressed += force.dot(normal)
+                            if past.norm_sqr() == 0.0 and gap + shift.dot(normal) < 0.0:
+                                hit = ti.max(hit, -shift.dot(normal) / dt)
+                        arrays.contact[p] = vec4(force[0], force[1], force[2], state)
+                        Q = -4.0 * tau @ H.inverse().transpose()
+                        spread_linear(offset + window_node, fx, force, Q, 0.0, nodes.scattered)
+                    arrays.report[k * REPORT + HIT] = hit
+                    arrays.report[k * REPORT + PRESSED] = sum_pressed
+        sum_nodes(grid, nodes, arrays)
+
+    return find_forces
+
+
+@func
+def relaxed(p: ti.i32, dt: ti.f32, H: mat3, worlds: WorldArrays, particles: ParticleArrays):
+    """Strain of the branch that relaxes after a step with the gradient ``H``."""
+    kept = ti.exp(-dt / worlds.materials[particles.material[p] * ROW + RELAXATION_TIME])
+    one = ti.Matrix.identity(ti.f32, 3)
+    return one + kept * (H @ particles.conformation[p] @ H.transpose() - one)
+
+
+@func
+def stress_after(laws: ti.template(), p: ti.i32, dt: ti.f32, H: mat3, worlds: WorldArrays, particles: ParticleArrays):
+    """Kirchhoff stress times volume of particle ``p`` after a step with the gradient ``H``."""
+    fixed = particles.constants[p]
+    F = H @ particles.F[p]
+    tau = mat3(0.0)
+    if ti.static(laws.only_elastic):
+        tau, _, _ = laws.solid[0].stress(F, H, 0.0, fixed[1], fixed[2], fixed)
+    else:
+        row = particles.material[p] * ROW
+        law = ti.cast(worlds.materials[row], ti.i32)
+        for model in ti.static(laws.solid):
+            if law == model.number:
+                tau, _, _ = model.stress(F, H, 0.0, fixed[1], fixed[2], own_numbers(row, worlds))
+        if ti.static(laws.relaxing):
+            share = worlds.materials[row + RELAXING_SHARE]
+            if share > 0.0:
+                B = relaxed(p, dt, H, worlds, particles)
+                for i in ti.static(range(3)):
+                    B[i, i] -= 1.0
+                tau += (0.5 * share * fixed[1]) * B
+    return tau
+
+
+@func
+def moduli(laws: ti.template(), p: ti.i32, dt: ti.f32, worlds: WorldArrays, particles: ParticleArrays):
+    """2 mu V0 and lambda V0 of particle ``p`` for a step of ``dt``, with what has no time to relax in it."""
+    two_mu, lam = particles.constants[p][1], particles.constants[p][2]
+    if ti.static(laws.relaxing):
+        row = particles.material[p] * ROW
+        share = worlds.materials[row + RELAXING_SHARE]
+        if share > 0.0:
+            two_mu *= 1.0 + share * ti.exp(-dt / worlds.materials[row + RELAXATION_TIME])
+    return two_mu, lam
+
+
+@functools.cache
+def multiply_stiffness_of(laws: int) -> BundledKernel:
+    """Kernel of the stiffness for the set ``laws`` of constitutive models."""
+    models = law_set(laws)
+
+    @kernel
+    def multiply_stiffness(
+        dt: ti.f32,
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        arrays: ImplicitArrays,
+    ):
+        """K times ``given``; contacts are in the state that ``find_forces`` has found last."""
+        for kk in range(turns(SERIAL, blocks.count, nodes.window) * SPREAD):
+            if kk % SPREAD == 0:
+                turn, all_turns = kk // SPREAD, turns(SERIAL, blocks.count, nodes.window)
+                spot = turn * WINDOW_NODES
+                for k in range(turn * blocks.count // all_turns, (turn + 1) * blocks.count // all_turns):
+                    load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
+                    offset = k * WINDOW_NODES
+                    clear_window(SERIAL, 0, offset, nodes.scattered)
+                    normal, _level = ground_of(k, worlds, blocks)
+                    for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                        _, base, fx = place_of(particles.x[p])
+                        window_node = first_of(base, nodes.window)
+                        shift, G = value_and_gradient(spot + window_node, fx, nodes.window)
+                        two_mu, lam = moduli(models, p, dt, worlds, particles)
+                        stress = (2.0 * two_mu) * (G + G.transpose())
+                        for r in ti.static(range(3)):
+                            stress[r, r] += 4.0 * lam * G.trace()
+                        force = vec3(0.0)
+                        state = arrays.contact[p][3]
+                        if state != FREE:
+                            fixed = particles.constants[p]
+                            spring = CONTACT_STIFFNESS * (fixed[1] + fixed[2])
+                            # What slides counts as held by a weaker spring (iteratively reweighted least squares).
+                            along = shift.dot(normal)
+                            force = spring * (state * shift + (1.0 - state) * along * normal)
+                        spread_linear(offset + window_node, fx, force, stress, 0.0, nodes.scattered)
+        sum_nodes(grid, nodes, arrays)
+
+    return multiply_stiffness
+
+
+@functools.cache
+def find_diagonal_of(laws: int) -> BundledKernel:
+    """Kernel of the diagonal of the stiffness for the set ``laws`` of constitutive models."""
+    models = law_set(laws)
+
+    @kernel
+    def find_diagonal(
+        dt: ti.f32,
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        arrays: ImplicitArrays,
+    ):
+        """Diagonal of K (kg/s²), without contacts."""
+        for kk in range(blocks.count * SPREAD):
+            if kk % SPREAD == 0:
+                k = kk // SPREAD
+                offset = k * WINDOW_NODES
+                clear_window(SERIAL, 0, offset, nodes.scattered)
+                for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                    _, base, fx = place_of(particles.x[p])
+                    two_mu, lam = moduli(models, p, dt, worlds, particles)
+                    w3 = weights(fx)
+                    first = offset + first_of(base, nodes.scattered)
+                    for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
+                        w = 4.0 * w3[i][0] * w3[j][1] * w3[m][2]
+                        d = w * (vec3(float(i), float(j), float(m)) - fx)
+                        across = 0.5 * two_mu * d.norm_sqr()
+                        more = 0.5 * two_mu + lam
+                        share = vec4(
+                            across + more * d[0] * d[0], across + more * d[1] * d[1], across + more * d[2] * d[2], 0.0
+                        )
+                        add_to(nodes.scattered, first + (i * 64 + j * 8 + m), share)
+        sum_nodes(grid, nodes, arrays)
+
+    return find_diagonal
+
+
+@functools.cache
+def move_particles_of(laws: int) -> BundledKernel:
+    """Kernel of the end of a step for the set ``laws`` of constitutive models."""
+    models = law_set(laws)
+
+    @kernel
+    def move_particles(
+        dt: ti.f32,
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        arrays: ImplicitArrays,
+    ):
+        """Particles to the end of the step: displacements ``given``, velocities ``motion``, forces ``contact``. The
+        velocity gradient is that in the place where the matter has come to."""
+        for kk in range(turns(SERIAL, blocks.count, nodes.window) * SPREAD):
+            if kk % SPREAD == 0:
+                turn, all_turns = kk // SPREAD, turns(SERIAL, blocks.count, nodes.window)
+                spot = turn * WINDOW_NODES
+                for k in range(turn * blocks.count // all_turns, (turn + 1) * blocks.count // all_turns):
+                    speed2, farthest = 0.0, 0.0
+                    load_window(k, spot, blocks.neighbours, nodes.window, arrays.motion)
+                    for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                        _, base, fx = place_of(particles.x[p])
+                        v, C = value_and_gradient(spot + first_of(base, nodes.window), fx, nodes.window)
+                        particles.v[p] = v
+                        particles.C[p] = C
+                        speed2 = ti.max(speed2, v.norm_sqr())
+                    load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
+                    for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                        x = particles.x[p]
+                        _, base, fx = place_of(x)
+                        shift, H = value_and_gradient(spot + first_of(base, nodes.window), fx, nodes.window)
+                        for r in ti.static(range(3)):
+                            H[r, r] += 1.0
+                        particles.C[p] = particles.C[p] @ H.inverse()
+                        particles.F[p] = H @ particles.F[p]
+                        if ti.static(models.relaxing):
+                            if worlds.materials[particles.material[p] * ROW + RELAXING_SHARE] > 0.0:
+                                particles.conformation[p] = relaxed(p, dt, H, worlds, particles)
+                        particles.x[p] = ti.min(
+                            ti.max(x + ti.floor(shift * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH
+                        )
+                        force, m = arrays.contact[p], particles.constants[p][0]
+                        share = particles.reaction[p][3]
+                        particles.reaction[p] = vec4(force[0] / m, force[1] / m, force[2] / m, share)
+                        farthest = ti.max(farthest, shift.norm_sqr())
+                    arrays.report[k * REPORT + FASTEST] = speed2
+                    arrays.report[k * REPORT + FARTHEST] = ti.sqrt(farthest)
+
+    return move_particles
