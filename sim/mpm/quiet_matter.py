@@ -115,7 +115,7 @@ class QuietMatter:
             explicit = min(float(engine.stable_steps()[0]), longest_step)
             implicit = self._longest(engine, most_hit)
             if implicit > PAYS * explicit and left > PAYS * explicit and self._quiet(engine, most_hit):
-                left, wasted = self._advance_implicitly(engine, left, implicit, explicit, most_hit, stop)
+                left, wasted = self._advance_implicitly(engine, left, explicit, most_hit, stop)
             if left > 0:
                 burst = max(BURST, 2 * wasted) * explicit
                 burst = left if left < 1.5 * burst else burst
@@ -163,7 +163,7 @@ class QuietMatter:
         return math.sqrt(float((m * deforming**2).sum() / m.sum())) < most_hit
 
     def _advance_implicitly(
-        self, engine: Engine, left: float, longest: float, explicit: float, most_hit: float, stop: IsCancelled
+        self, engine: Engine, left: float, explicit: float, most_hit: float, stop: IsCancelled
     ) -> tuple[float, int]:
         """Take implicit steps while they can be had and pay; the seconds that are left, and the passes over the
         particles of a step that did not pay."""
