@@ -36,7 +36,12 @@ lattice would be visible in a heap.
 """
 SURFACE, VOXEL, SHRINK, BLUR = 1.1, 0.6, 0.7, 2
 """Surface parameters, over the particle spacing: radius of the merged balls, which closes gaps between neighbours;
-voxel size; inward offset afterwards, so that it ends at the material's boundary. And the number of smoothing steps.
+voxel size; inward offset afterwards, so that it ends about at the material's boundary. And the number of smoothing
+steps.
+"""
+STEPS, FARTHEST = 3, 0.4
+"""Corrections of the surface's offset, so that it holds the volume of its particles, and the largest of each, over the
+particle spacing.
 """
 
 
@@ -69,6 +74,8 @@ def show(
         item = None
     if item is None:
         item = _add(body, name, cache.sample(0))
+        if surface:
+            distance = spacing_inside(body.data, cache.vertex_count) or distance
         _add_look(item, distance, surface=surface)
     point_caches.attach_as_first(item, cache, path, first_frame)
     set_input(item.modifiers[MODIFIER], FROM, from_frame)
@@ -141,6 +148,31 @@ def add_part(body: bpy.types.Object, name: str, mesh: bpy.types.Mesh, label: str
     return item
 
 
+def spacing_inside(mesh: bpy.types.Mesh, count: int) -> float | None:
+    """Return the side (m) of a cube of the volume of each of ``count`` particles that fill ``mesh``; None where that
+    is not closed. The distance of neighbours is no measure of a volume: on a lattice it gives one a third too large.
+    """
+    mesh.calc_loop_triangles()
+    corners = np.empty(3 * len(mesh.loop_triangles), dtype=np.int32)
+    mesh.loop_triangles.foreach_get("vertices", corners)
+    places = np.empty(3 * len(mesh.vertices), dtype=np.float32)
+    mesh.vertices.foreach_get("co", places)
+    triangles, points = corners.reshape(-1, 3), places.reshape(-1, 3).astype(np.float64)
+    found = volume(points, triangles)
+    # Each edge once in either direction.
+    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    closed = len(ends) > 0 and np.array_equal(np.unique(ends, axis=0), np.unique(ends[:, ::-1], axis=0))
+    return (found / count) ** (1 / 3) if closed and count and found > 0 else None
+
+
+def volume(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
+    """Return the volume (m³) inside of the triangles ``faces`` (T, 3) of ``vertices`` (V, 3), above 0 if outwards."""
+    if not len(faces):
+        return 0.0
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
 def _add_look(item: bpy.types.Object, distance: float, *, surface: bool) -> None:
     modifier = item.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = _surface_group() if surface else _grains_group()
@@ -204,6 +236,7 @@ def enclosing_surface(tree: Tree, points: Any, radius: Any) -> Any:
     """Return the smoothed surface of balls of ``radius`` around the vertices ``points``, offset inward to the
     material's boundary.
     """
+    count = tree.node("GeometryNodeAttributeDomainSize", points, component="MESH").outputs["Point Count"]
     points = tree.out("GeometryNodeMeshToPoints", points, None, None, radius)
     volume = tree.node("GeometryNodePointsToVolume")
     compat.set_resolution(volume, "Size")
@@ -217,8 +250,39 @@ def enclosing_surface(tree: Tree, points: Any, radius: Any) -> Any:
     even = tree.out("GeometryNodeBlurAttribute", place, BLUR, data_type="FLOAT_VECTOR")
     inwards = tree.node("ShaderNodeVectorMath", normal, operation="SCALE")
     tree.group.links.new(tree.math("MULTIPLY", radius, -SHRINK / SURFACE), inwards.inputs["Scale"])
-    drawn_in = tree.out("GeometryNodeSetPosition", mesh.outputs[0], None, even, inwards.outputs[0])
-    return tree.out("GeometryNodeSetShadeSmooth", drawn_in)
+    surface = tree.out("GeometryNodeSetPosition", mesh.outputs[0], None, even, inwards.outputs[0])
+    wanted = tree.math("MULTIPLY", count, tree.math("POWER", tree.math("DIVIDE", radius, SURFACE), 3.0))
+    farthest = tree.math("MULTIPLY", radius, FARTHEST / SURFACE)
+    for _ in range(STEPS):
+        surface = _towards_volume(tree, surface, wanted, farthest)
+    return tree.out("GeometryNodeSetShadeSmooth", surface)
+
+
+def _towards_volume(tree: Tree, surface: Any, wanted: Any, farthest: Any) -> Any:
+    """Return the closed ``surface``, moved evenly along its normals, at most by ``farthest`` (m), to hold the volume
+    ``wanted`` (m³): a step of Newton's method, since volume changes with the offset at the rate of the area.
+    """
+    place, normal = tree.out("GeometryNodeInputPosition"), tree.out("GeometryNodeInputNormal")
+    face = tree.out("GeometryNodeInputMeshFaceArea")
+    # From the middle of the surface, or digits would be lost far from the origin.
+    middle = tree.node("GeometryNodeAttributeStatistic", surface, None, place, data_type="FLOAT_VECTOR")
+    arm = tree.out("ShaderNodeVectorMath", place, _enabled(middle, "Mean"), operation="SUBTRACT")
+    height = tree.node("ShaderNodeVectorMath", arm, normal, operation="DOT_PRODUCT").outputs["Value"]
+    total = {}
+    for name, value in (("volume", tree.math("MULTIPLY", height, face)), ("area", face)):
+        found = tree.node("GeometryNodeAttributeStatistic", surface, None, value, data_type="FLOAT", domain="FACE")
+        total[name] = _enabled(found, "Sum")
+    lacking = tree.math("SUBTRACT", wanted, tree.math("DIVIDE", total["volume"], 3.0))
+    step = tree.math("DIVIDE", lacking, total["area"])
+    step = tree.math("MAXIMUM", tree.math("MINIMUM", step, farthest), tree.math("MULTIPLY", farthest, -1.0))
+    outwards = tree.node("ShaderNodeVectorMath", normal, operation="SCALE")
+    tree.group.links.new(step, outwards.inputs["Scale"])
+    return tree.out("GeometryNodeSetPosition", surface, None, None, outwards.outputs[0])
+
+
+def _enabled(node: bpy.types.Node, name: str) -> Any:
+    """Return the visible output ``name`` of ``node``, which may have several of that name."""
+    return next(s for s in node.outputs if s.enabled and s.name == name)
 
 
 def _switch_group(name: str, *, shown_first: bool) -> bpy.types.NodeTree:

@@ -68,7 +68,7 @@ def add_surface(
     """
     assert flow.from_sample is not None
     rest = flow.cache.sample(0)
-    distance = spacing(rest)
+    distance = particles.spacing_inside(target.item.data, len(rest)) or spacing(rest)
     radius = distance * particles.SURFACE
     mesh = bpy.data.meshes.new(f"{target.item.name} particles")
     mesh.vertices.add(len(rest))

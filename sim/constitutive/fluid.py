@@ -24,7 +24,8 @@ TAIT = 7.0
 
 LOOSE = 0.02
 PACKED = -1.0
-"""Limits of ln J: fluid that flies apart forgets how far, so that it meets resistance when it returns."""
+"""Limits of ln J as it is integrated: fluid that flies apart forgets how far, so that drops resist when they land.
+Beyond LOOSE ln J only follows the density of the grid (``crowding``)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +98,6 @@ class FluidMaterial(DeformableMaterial):
 
         @ti.func
         def advance_volume(memory, dt, C):
-            return ti.min(ti.max(memory + dt * C.trace(), PACKED), LOOSE)
+            return ti.min(ti.max(memory + dt * C.trace(), PACKED), ti.max(memory, LOOSE))
 
         return DeviceFunctions(stress=stress, advance_volume=advance_volume)

@@ -84,7 +84,8 @@ class BlockLists:
             self._meet_g, self._leads = new_array(ti.i32, g), new_array(ti.i32, g)
             self._nodes, self._sums = new_array(vec4, g * BLOCK_NODES), new_array(vec4, g * BLOCK_NODES)
             self._past_nodes = new_array(vec4, g * BLOCK_NODES if self._flowing else 1)
-            self._crowding = new_array(ti.f32, g * BLOCK_NODES if self._fluid else 1)
+            self._crowding, self._fill = (new_array(ti.f32, g * BLOCK_NODES if self._fluid else 1) for _ in range(2))
+            self._around = new_array(ti.i32, g * 27 if self._fluid else 1)
             crowded = max(1, g * self._rigid_bodies * PUSH) if self._fluid else 1
             self._crowd_pushes = new_array(ti.f32, crowded)
             self._masses = new_array(ti.f32, g * BLOCK_NODES)
@@ -128,6 +129,8 @@ class BlockLists:
                 break
             self._allocate(0, int(GROWTH * self._g_count) + LEAST_BLOCKS)
         sorting.link_blocks.launch(self.particle_blocks, self.grid_blocks, self._p_table, self._g_table)
+        if self._fluid:
+            sorting.link_grid_blocks.launch(self.grid_blocks, self._g_table, self._around)
         if self._lanes.parallel:
             blocks = self.particle_blocks
             parallel_sorting.place_in_turn.launch(count, x, keys, self._cursors, targets, self._p_table, blocks)
@@ -234,6 +237,8 @@ class BlockLists:
             self._past_nodes,
             self._crowding,
             self._crowding_window,
+            self._fill,
+            self._around,
             self._crowd_pushes,
         )
 

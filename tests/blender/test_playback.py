@@ -130,6 +130,28 @@ def test_object_is_a_mesh_until_it_turns_to_sand(a_bake):
     assert moved.mean(axis=0) == pytest.approx(np.array([0, 0, 1]) + 2 * STEP, abs=1e-5)
 
 
+@pytest.mark.parametrize("apart", [0.0, 2.5])
+def test_a_liquids_surface_holds_the_volume_of_its_particles(apart):
+    """Within 2 %, the requirement, of a cube of 8³ particles with and without a tenth of them flown off, which count as
+    drops. Without correction the surface of a cube at rest lacks 6 to 10 % and a splash a third."""
+    bpy.ops.mesh.primitive_cube_add(size=0.8)
+    cube = bpy.context.object
+    assert particles.spacing_inside(cube.data, 512) == pytest.approx(0.1, rel=1e-5)
+    steps = (np.arange(8) - 3.5) * 0.1
+    points = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    points[::10] += apart * (points[::10] + np.array([0, 0, 1]))
+    mesh = bpy.data.meshes.new("drops")
+    mesh.from_pydata(points, [], [])
+    item = bpy.data.objects.new("drops", mesh)
+    bpy.context.collection.objects.link(item)
+    particles._add_look(item, 0.1, surface=True)
+    surface = item.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+    surface.calc_loop_triangles()
+    places = np.array([vertex.co for vertex in surface.vertices])
+    faces = np.array([triangle.vertices for triangle in surface.loop_triangles])
+    assert particles.volume(places, faces) == pytest.approx(0.512, rel=0.02)
+
+
 def test_looks_follow_from_the_matter():
     bpy.ops.mesh.primitive_cube_add()
     item = bpy.context.object

@@ -18,8 +18,11 @@ the particles of SPH). It is no stress, because a stress acts only on what chang
     4 dt k K/rho0 m_p d_i w_ip (x_i - x_p)
 
 along their line, so both momenta stay; what takes room at a node is pushed by k K d_i |grad A|, and pushes back.
-Besides, ln J of the particles slowly gives way. Where particles fill what ln J says, all d are 0 and nothing changes.
-Nodes at a free surface are not full either; they are left out (``LOOSE``).
+Besides, ln J of the particles slowly gives way, in gaps as well. Where it is above 0, so that there is no pressure, it
+follows the nodes at once: fluid that has flown apart and comes together meets no resistance before it is full again.
+Its own integral, which forgets how far (``fluid.LOOSE``), would keep it apart for good. Where particles fill what ln J
+says, all d are 0 and nothing changes. Nodes at a free surface are not full either; ``inside`` tells them from gaps by
+the nodes around (as cells beside empty ones are the surface in FLIP, Zhu and Bridson 2005).
 """
 
 import taichi as ti
@@ -75,7 +78,22 @@ RELAXED = 0.001
 lags behind the motion feeds it: a share above the stiffness times what the transfers damp would keep a pond moving."""
 
 LOOSE = 0.03
-"""ln of the mass that a node may lack before it counts as one of the free surface; from twice that on it does."""
+"""Crowding below 0 that pulls fully; from twice that on nothing pulls, so that splashes do not clump."""
+
+FREE = 0.1
+"""Share of the crowding that ln J of fluid without pressure takes up per substep. It has no force there, so this feeds
+no motion."""
+
+MOST = 1.0
+"""Largest ln J that crowding gives."""
+
+OUTER, INNER = 0.5, 0.75
+"""A node belongs to the surface where one of the 26 around is less than OUTER times as full, and to the inside where
+none is less than INNER times. At a plane surface 1.15 cells away these are 0.6 times as full, and the node lacks a
+hundredth; disorder makes nodes differ by a twentieth to a tenth."""
+
+LEAST_FILL = 1e-3
+"""Least share of a node that counts as full."""
 
 LEAST_ROOM = 0.05
 """Share of a node's surroundings below which it is no measure: so little mass is there that its share is chance."""
@@ -84,9 +102,9 @@ NOTHING = 1e3
 """Crowding of nodes that are no measure."""
 
 BESIDE = 0.03
-"""Largest crowding of a node beside ground or bodies. Their surfaces count as faces, which at a convex edge leaves as
-little as half of the room that there is: ln of that is some twenty times the crowding of a pond, and lifted what
-floats."""
+"""Largest crowding of a node beside ground or bodies; the least is that which pulls nothing. Their surfaces count as
+faces, which at a convex edge leaves as little as half of the room that there is: ln of that is some twenty times the
+crowding of a pond, and lifted what floats."""
 
 PUSHED = 6
 """Place in a row of ``FlowArrays.pushes`` that says whether the body takes room in the block."""
@@ -147,7 +165,7 @@ def leave_room(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, no
 
 
 @func
-def find_crowding(
+def measure_fill(
     meeting: ti.template(),
     worlds: WorldArrays,
     grid: GridBlocks,
@@ -158,8 +176,8 @@ def find_crowding(
     shapes: ShapeArrays,
     coupling: CouplingArrays,
 ):
-    """Crowding of all nodes of fluids, from their mass and mean ln J, and what it does to rigid bodies. meeting:
-    whether ``leave_room`` was called."""
+    """Room at all nodes of fluids, to ``flow.crowding``, and ln of the part of it that is full, to ``flow.fill``.
+    meeting: whether ``leave_room`` was called."""
     for gg in range(grid.count * SPREAD):
         if gg % SPREAD == 0:
             g = gg // SPREAD
@@ -178,23 +196,74 @@ def find_crowding(
                         for i in range(BLOCK_NODES):
                             flow.crowding[first + i] = 1.0
                     take_room(g, w, worlds, grid, nodes, flow, bodies, shapes, coupling)
-                    dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
-                    modulus = full * worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
                     for i in range(BLOCK_NODES):
-                        mass, room = nodes.mass[first + i], flow.crowding[first + i]
-                        crowding = NOTHING
-                        if mass > 0.0 and room > LEAST_ROOM:
-                            filled = ti.log(ti.max(mass / (full * room), 1e-3))
-                            crowding = 0.0
-                            if filled > -2.0 * LOOSE:
-                                if filled < -LOOSE:
-                                    filled = -(2.0 * LOOSE + filled)
-                                crowding = filled + flow.velocity[first + i][3]
-                                if room < 1.0:
-                                    crowding = ti.min(crowding, BESIDE)
-                                    strength = dt * STIFFNESS * modulus * crowding * room
-                                    push_apart(g, i, w, strength, worlds, grid, nodes, flow, bodies, shapes, coupling)
-                        flow.crowding[first + i] = crowding
+                        fill, room = NOTHING, flow.crowding[first + i]
+                        if room > LEAST_ROOM:
+                            fill = ti.log(ti.max(nodes.mass[first + i] / (full * room), LEAST_FILL))
+                        flow.fill[first + i] = fill
+
+
+@func
+def inside(g: ti.i32, i: ti.i32, fill: ti.f32, grid: GridBlocks, flow: FlowArrays):
+    """Share, 0 to 1, to which node ``i`` of grid block ``g`` lies inside of the fluid and not at its surface."""
+    least = fill
+    for d in range(27):
+        node = ivec3(i // 16, i // 4 % 4, i % 4) + ivec3(d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1)
+        side = (node + 4) // 4
+        block = flow.around[g * 27 + side[0] * 9 + side[1] * 3 + side[2]]
+        other = ti.log(LEAST_FILL)
+        if block >= 0:
+            other = flow.fill[block * BLOCK_NODES + (node[0] & 3) * 16 + (node[1] & 3) * 4 + (node[2] & 3)]
+        least = ti.min(least, other)
+    return ti.min(ti.max((ti.exp(least - fill) - OUTER) / (INNER - OUTER), 0.0), 1.0)
+
+
+@func
+def find_crowding(
+    meeting: ti.template(),
+    worlds: WorldArrays,
+    grid: GridBlocks,
+    overlap: OverlapBlocks,
+    nodes: NodeArrays,
+    flow: FlowArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    coupling: CouplingArrays,
+):
+    """Crowding of all nodes of fluids, from ``measure_fill`` and mean ln J, and what it does to rigid bodies."""
+    for gg in range(grid.count * SPREAD):
+        if gg % SPREAD == 0:
+            g = gg // SPREAD
+            f = grid.field[g]
+            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+            full = worlds.field_numbers[f * FIELD_ROW + FULL_MASS]
+            if worlds.control[w * CONTROL_ROW + PHASE] == FULL and full > 0.0:
+                first = g * BLOCK_NODES
+                shared = False
+                if ti.static(meeting):
+                    shared = overlap.slot[g] >= 0
+                dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
+                modulus = full * worlds.field_numbers[f * FIELD_ROW + SOUND_SPEED_SQUARED]
+                for i in range(BLOCK_NODES):
+                    fill, room = flow.fill[first + i], flow.crowding[first + i]
+                    crowding = NOTHING
+                    if nodes.mass[first + i] > 0.0 and fill < NOTHING:
+                        crowding = fill + flow.velocity[first + i][3]
+                        if fill < 0.0:
+                            crowding *= inside(g, i, fill, grid, flow)
+                        if room < 1.0:
+                            crowding = ti.min(ti.max(crowding, -2.0 * LOOSE), BESIDE)
+                            if shared:
+                                crowding = felt(crowding)
+                            strength = dt * STIFFNESS * modulus * felt(crowding) * room
+                            push_apart(g, i, w, strength, worlds, grid, nodes, flow, bodies, shapes, coupling)
+                    flow.crowding[first + i] = crowding
+
+
+@ti.func
+def felt(crowding: ti.f32):
+    """Crowding as far as it pushes and pulls: gaps beyond ``LOOSE`` pull less, and from twice that on not at all."""
+    return ti.max(crowding, ti.min(-(2.0 * LOOSE + crowding), 0.0))
 
 
 @func
@@ -229,10 +298,9 @@ def take_room(
             flow.pushes[row + PUSHED] = 1.0
             for i in range(BLOCK_NODES):
                 n = g * BLOCK_NODES + i
-                if nodes.mass[n] > 0.0:
-                    at = ti.cast(ivec3(i // 16, i // 4 % 4, i % 4), ti.f32)
-                    distance, _, _ = body_distance(first + o, corner + at, FARTHEST, bodies, shapes)
-                    flow.crowding[n] *= 1.0 - share_beyond(distance)
+                at = ti.cast(ivec3(i // 16, i // 4 % 4, i % 4), ti.f32)
+                distance, _, _ = body_distance(first + o, corner + at, FARTHEST, bodies, shapes)
+                flow.crowding[n] *= 1.0 - share_beyond(distance)
 
 
 @func
@@ -335,7 +403,14 @@ def load_crowding(
 
 
 @ti.func
-def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window: Scalars, scattered: ti.template()):
+def part_crowd(
+    known: ti.i32,
+    first: ti.i32,
+    fx: vec3,
+    strength: ti.f32,
+    window: Scalars,
+    scattered: ti.template(),
+):
     """Mean crowding at ``fx`` from the window's node ``known``, and the impulse on the particle there; the nodes take
     the opposite, along the line to the particle, so both momenta stay. Nodes that are no measure count as the mean of
     the others. strength: impulse at a slope of 1 per cell."""
@@ -353,8 +428,17 @@ def part_crowd(known: ti.i32, first: ti.i32, fx: vec3, strength: ti.f32, window:
         crowding = window[known + (i * 64 + j * 8 + m)]
         if crowding >= NOTHING:
             crowding = mean
-        push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * crowding) * (vec3(i, j, m) - fx)
+        push = (4.0 * strength * w[i][0] * w[j][1] * w[m][2] * felt(crowding)) * (vec3(i, j, m) - fx)
         given -= push
         n = first + (i * ti.static(layer(scattered)) + j * 8 + m)
         add_to(scattered, n, vec4(push[0], push[1], push[2], 0.0))
     return mean, given
+
+
+@ti.func
+def relaxed(memory: ti.f32, crowding: ti.f32):
+    """ln J after a substep of a particle at which the mean crowding is ``crowding``."""
+    now = memory - RELAXED * crowding
+    if memory > 0.0:
+        now = ti.min(ti.max(memory - FREE * crowding, 0.0), MOST)
+    return now

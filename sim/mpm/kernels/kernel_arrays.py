@@ -270,6 +270,12 @@ class FlowArrays(NamedTuple):
     crowding_window: Scalars
     """(., WINDOW_NODES) copy of the crowding around the particle block at hand; on a card (P, WINDOW_NODES)."""
 
+    fill: Scalars
+    """(G, BLOCK_NODES) ln of the share of a node's room that is full; length 1 without fluids."""
+
+    around: Integers
+    """(G, 27) grid blocks of the same field around a grid block, -1 for none; length 1 without fluids."""
+
     pushes: Scalars
     """(G, most_bodies, PUSH) what crowding in a block does to a body, as in ``CouplingArrays``; last but one: whether
     it does anything."""

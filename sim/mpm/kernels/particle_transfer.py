@@ -18,7 +18,7 @@ import taichi as ti
 
 from .constitutive_response import deform, is_fluid, law_of, respond
 from .constitutive_response import flows as material_flows
-from .crowding import RELAXED, STIFFNESS, load_crowding, part_crowd
+from .crowding import STIFFNESS, load_crowding, part_crowd, relaxed
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
 from .lanes import lane_maxima, lane_sum, meet
@@ -288,7 +288,7 @@ def advance_block(
                                 known, first - spot + offset, fx, strength, flow.crowding_window, pads.scattered
                             )
                             vp += given / fixed[0]
-                            particles.memory[p] -= RELAXED * crowding
+                            particles.memory[p] = relaxed(particles.memory[p], crowding)
                     particles.v[p] = vp
                     particles.C[p] = Cp
                     if ti.static(len(laws.volumetric) > 0):

@@ -217,6 +217,14 @@ def link_blocks(blocks: ParticleBlocks, grid: GridBlocks, p_table: BlockTable, g
 
 
 @kernel
+def link_grid_blocks(grid: GridBlocks, table: BlockTable, around: Integers):
+    """The 27 grid blocks around each grid block, for fluids."""
+    for t in range(grid.count * 27):
+        g = t // 27
+        around[t] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(t % 27)), table)
+
+
+@kernel
 def place(count: ti.i32, keys: Keys, cursors: Integers, targets: Integers, table: BlockTable):
     """New index of every particle; particles of a block keep their order."""
     past = ti.cast(-1, ti.i64)

@@ -23,7 +23,7 @@ from ..rigid.rigid_motion import predict, rigid_substep
 from .adhesion import sum_reached
 from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
-from .crowding import add_pushes, find_crowding, leave_room, push_fields
+from .crowding import add_pushes, find_crowding, leave_room, measure_fill, push_fields
 from .deformable_contact import gather_shares, scatter_shares, separate
 from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
@@ -110,6 +110,7 @@ def crowd_fluids_of(meeting: bool) -> BundledKernel:
         coupling: CouplingArrays,
     ):
         """Crowding at the nodes, and what it does to the bodies around, before contact."""
+        measure_fill(meeting, worlds, grid, overlap, nodes, flow, bodies, shapes, coupling)
         find_crowding(meeting, worlds, grid, overlap, nodes, flow, bodies, shapes, coupling)
         if ti.static(meeting):
             push_fields(worlds, grid, overlap, nodes, flow)
