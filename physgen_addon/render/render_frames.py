@@ -39,7 +39,7 @@ from .motion_blur import Pose
 from .render_options import RenderOptions
 from .renderer import DataLayers, Renderer
 
-RENDER_REVISION = 19
+RENDER_REVISION = 20
 """Increased with every change of rendering that affects frames."""
 
 
