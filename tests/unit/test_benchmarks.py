@@ -26,6 +26,7 @@ FAST = (
     "rest",
     "shapes",
     "splats",
+    "stiff",
     "worlds",
 )
 SLOW = ("calibration", "compose", "demo", "first_frame", "light", "published", "reconstruct", "thin_parts")
