@@ -10,7 +10,6 @@ Exit codes: 0 done, 2 usage, 3 bad input, 5 Blender failed, 130 cancelled; FILE 
 from __future__ import annotations
 
 import argparse
-import math
 import runpy
 import sys
 from collections.abc import Sequence
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from ..sim.errors import Cancelled
     from ..sim.scene.folder import Scene
 
+ENDINGS = (".abc",)
+
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's own arguments."""
@@ -36,13 +37,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[dict[str, Any], str]:
     """Export; return the ``done`` event, and the same in words."""
+    from ..sim.app.export_usd import require_target
     from ..sim.cache.bake_check import unchanged_bake
     from ..sim.cache.bake_folder import load_bake
     from ..sim.errors import Cancelled
     from ..sim.scene.folder import load_scene, unchanged_scene
 
     scene, bake = load_scene(options.scene), load_bake(options.bake)
-    require_target(scene, bake, options.out)
+    require_target(scene, bake, options.out, ENDINGS)
     with unchanged_scene(scene), unchanged_bake(bake):
         for trouble in _show(scene, bake):
             on_event({"event": "notice", "stage": "export", "message": trouble})
@@ -54,24 +56,12 @@ def work(options: argparse.Namespace, on_event: Any, cancelled: Any) -> tuple[di
     return done, f"{frames} frames: {options.out}"
 
 
-def require_target(scene: Scene, bake: Bake, file: Path) -> None:
-    """Raise InputError where ``bake`` is of another scene, or ``file`` is there already or ends in another suffix."""
-    from ..sim.errors import InputError
-
-    if file.suffix.lower() != ".abc":
-        raise InputError(f"{file}: give a name that ends in .abc")
-    if file.exists():
-        raise InputError(f"{file}: is there already; choose another name")
-    if bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
-        raise InputError(f"{bake.root}: is the bake of another scene than {scene.root}; bake this one")
-
-
 def _show(scene: Scene, bake: Bake) -> list[str]:
     """Import ``scene`` into the empty Blender scene and let it play ``bake``; return problems of single objects."""
     import bpy
 
     from ..physgen_addon.playback import bake_record, show_bake
-    from ..physgen_addon.props.body_props import bodies
+    from ..physgen_addon.playback.capture_view import set_rate
     from ..physgen_addon.scene_io.export_animation import export_names
     from ..physgen_addon.scene_io.import_scene import import_scene
 
@@ -80,12 +70,9 @@ def _show(scene: Scene, bake: Bake) -> list[str]:
     bpy.ops.wm.read_homefile(use_empty=True)
     shown = bpy.context.scene
     import_scene(shown, scene.root)
-    fps = bake.manifest.fps
-    shown.render.fps = max(1, math.ceil(fps))
-    shown.render.fps_base = shown.render.fps / fps
+    set_rate(shown, bake.manifest.fps)
     first = shown.physgen.simulation.frame_start
-    names = export_names(shown)
-    looks = tuple(show_bake.look_of(item, names[item.name], first) for item in bodies(shown))
+    looks = show_bake.looks_of(shown, export_names(shown))
     return show_bake.show(
         shown, bake_record.BakeRecord(folder=str(bake.root.resolve()), frame_start=first, looks=looks)
     )
@@ -95,13 +82,10 @@ def _write(file: Path) -> None:
     """Run Blender's exporter. Raises RenderError where it fails."""
     import bpy
 
-    from ..sim.atomic import replacing
-    from ..sim.cache.folder_lock import lock_beside
-    from ..sim.errors import InputError, RenderError
+    from ..sim.app.export_usd import new_file
+    from ..sim.errors import RenderError
 
-    with lock_beside(file), replacing(file) as partial:
-        if file.exists():
-            raise InputError(f"{file}: is there already, written meanwhile; choose another name")
+    with new_file(file) as partial:
         try:
             finished = bpy.ops.physgen.export_alembic(filepath=str(partial.resolve())) == {"FINISHED"}
         except RuntimeError as error:

@@ -31,7 +31,7 @@ from ..sim.scene.bake_quality import load_quality
 from ..sim.scene.folder import Scene, require_photo
 from ..sim.scene.overrides import check_overrides
 from ..sim.scene.textured_mesh import texture_pixels
-from .export import require_target
+from .export import ENDINGS
 
 if TYPE_CHECKING:
     from ..sim.app.default_motion import DefaultMotion
@@ -139,7 +139,9 @@ def export_alembic(
 
 def run_export(scene: Scene, bake: Bake, file: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
     """Return the ``done`` event of the process of ``export_alembic``."""
-    require_target(scene, bake, file)
+    from ..sim.app.export_usd import require_target
+
+    require_target(scene, bake, file, ENDINGS)
     command = own_command("batch.export", str(scene.root.resolve()), "--bake", str(bake.root.resolve()))
     command += ["--out", str(file.resolve()), "--json", "--parent", str(os.getpid())]
     return run_stage(command, on_event, cancelled, failure=RenderError)

@@ -115,7 +115,7 @@ class Bake(JobOperator):
         start = scene.physgen.simulation.frame_start
         for item in bodies(scene):
             item.physgen.cache = names[item.name]
-        looks = tuple(show_bake.look_of(item, names[item.name], start) for item in bodies(scene))
+        looks = show_bake.looks_of(scene, names)
         record = BakeRecord(fingerprints=(fingerprint(scene),), frame_start=start, looks=looks)
         self._shown = 0
         self._is_first = not scene.physgen.simulation.bake

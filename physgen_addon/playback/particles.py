@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...sim.cache.bake_folder import BakedObject
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.cache.torn_skin_file import TornSkin, read_torn_skin
+from ...sim.mpm.geometry.triangles import signed_volume
 from .. import compat, paths
 from . import point_caches
 from .bake_record import BakeRecord
@@ -157,20 +158,12 @@ def spacing_inside(mesh: bpy.types.Mesh, count: int) -> float | None:
     mesh.loop_triangles.foreach_get("vertices", corners)
     places = np.empty(3 * len(mesh.vertices), dtype=np.float32)
     mesh.vertices.foreach_get("co", places)
-    triangles, points = corners.reshape(-1, 3), places.reshape(-1, 3).astype(np.float64)
-    found = volume(points, triangles)
+    triangles, points = corners.reshape(-1, 3).astype(np.int64), places.reshape(-1, 3).astype(np.float64)
     # Each edge once in either direction.
     ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     closed = len(ends) > 0 and np.array_equal(np.unique(ends, axis=0), np.unique(ends[:, ::-1], axis=0))
-    return (found / count) ** (1 / 3) if closed and count and found > 0 else None
-
-
-def volume(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
-    """Return the volume (m³) inside of the triangles ``faces`` (T, 3) of ``vertices`` (V, 3), above 0 if outwards."""
-    if not len(faces):
-        return 0.0
-    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    found = signed_volume(points, triangles) if closed else 0.0
+    return (found / count) ** (1 / 3) if count and found > 0 else None
 
 
 def _add_look(item: bpy.types.Object, distance: float, *, surface: bool) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,6 +34,12 @@ def look_of(item: bpy.types.Object, name: str, frame_start: int) -> Look:
     if body.sandy:
         return Look(name=name, shape=GRAINS, from_frame=max(body.sandy_frame, frame_start))
     return Look(name=name)
+
+
+def looks_of(scene: bpy.types.Scene, names: Mapping[str, str]) -> tuple[Look, ...]:
+    """Return how to show the bodies of ``scene`` from its first frame on. names: in the bake, by those in Blender."""
+    start = scene.physgen.simulation.frame_start
+    return tuple(look_of(item, names[item.name], start) for item in bodies(scene))
 
 
 def bound(scene: bpy.types.Scene) -> dict[str, bpy.types.Object]:

@@ -86,20 +86,15 @@ def export_usd(
     Raises InputError where usd-core is missing, the file exists, or the bake is of another scene; Cancelled.
     """
     file = Path(file)
-    if file.suffix.lower() not in ENDINGS:
-        raise InputError(f"{file}: give a name that ends in {' or '.join(ENDINGS)}")
+    require_target(scene, bake, file, ENDINGS)
     if any(unicodedata.category(c) == "Cc" for c in file.stem):
         raise InputError(f"{shown(file)}: USD names no textures by control characters; choose another name")
-    if file.exists():
-        raise InputError(f"{file}: is there already; choose another name")
     try:
         from pxr import Tf, Usd, UsdGeom, UsdPhysics
     except ImportError as error:
         if ran_out(error):
             raise
         raise InputError("export to USD needs usd-core: pip install 'physgen[usd]'") from None
-    if bake is not None and bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
-        raise InputError(f"{bake.root}: is the bake of another scene than {scene.root}; bake this one")
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -114,9 +109,7 @@ def export_usd(
     with unchanged_scene(scene), contextlib.nullcontext() if bake is None else unchanged_bake(bake):
         writer.write()
     # Only now: a texture or a file is never left of an export that failed.
-    with lock_beside(file), replacing(file) as partial, _written(writer.pictures):
-        if file.exists():
-            raise InputError(f"{file}: is there already, written meanwhile; choose another name")
+    with new_file(file) as partial, _written(writer.pictures):
         try:
             good = stage.GetRootLayer().Export(str(partial))
         except Tf.ErrorException:
@@ -124,6 +117,25 @@ def export_usd(
         if not good:
             raise InputError(f"{file}: cannot be written; free space or choose another folder")
     return tuple(writer.notes)
+
+
+def require_target(scene: Scene, bake: Bake | None, file: Path, endings: Sequence[str]) -> None:
+    """Raise InputError where ``file`` has another suffix or is there already, or ``bake`` is of another scene."""
+    if file.suffix.lower() not in endings:
+        raise InputError(f"{file}: give a name that ends in {' or '.join(endings)}")
+    if file.exists():
+        raise InputError(f"{file}: is there already; choose another name")
+    if bake is not None and bake.manifest.geometry_hash not in ("", scene.geometry_hash()):
+        raise InputError(f"{bake.root}: is the bake of another scene than {scene.root}; bake this one")
+
+
+@contextlib.contextmanager
+def new_file(file: Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes ``file``. Raises InputError if that was written meanwhile."""
+    with lock_beside(file), replacing(file) as partial:
+        if file.exists():
+            raise InputError(f"{file}: is there already, written meanwhile; choose another name")
+        yield partial
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .kernels import implicit_step
 from .kernels.implicit_step import FARTHEST, FASTEST, HIT, PRESSED, REPORT, ImplicitArrays
@@ -130,14 +131,6 @@ def rigid_part(m: Array, x: Array, v: Array) -> Rigid:
     return Rigid(centre, velocity, momentum, inertia, np.linalg.solve(inertia, momentum))
 
 
-def turn(vector: Array) -> Array:
-    """Matrix (3, 3) of the rotation about ``vector`` by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * K @ K)
-
-
 class Prediction(NamedTuple):
     """A body after a step of its rigid motion: displacements (n, 3), that motion, the deforming velocities (n, 3) that
     are left, turned along, and the acceleration (3,) along the ground that it slides with: 0 where it sticks, None in
@@ -174,9 +167,9 @@ def predict(m: Array, x: Array, v: Array, gravity: Array, dt: float, *, support:
     spin = rigid.spin
     for _ in range(3):
         # The angular velocity of the middle of the step, where the body has turned by half.
-        half = turn(0.5 * dt * spin)
+        half = Rotation.from_rotvec(0.5 * dt * spin).as_matrix()
         spin = np.linalg.solve(half @ rigid.inertia @ half.T, rigid.momentum)
-    R = turn(dt * spin)
+    R = Rotation.from_rotvec(dt * spin).as_matrix()
     centre = rigid.centre + dt * rigid.velocity + dt * dt * ahead
     inertia = R @ rigid.inertia @ R.T
     spin = np.linalg.solve(inertia, rigid.momentum)

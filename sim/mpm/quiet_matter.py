@@ -10,7 +10,9 @@ anything is going on, and implicit ones in between; whether it does depends on i
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,8 @@ from .kernels import layout
 from .packing import WorldSlot, materials_of
 from .surface_contact import GROUND_NAME
 from .world_setup import WorldSetup
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -87,6 +91,17 @@ def _why_contact(setup: WorldSetup, body: BodyParticles) -> str | None:
     if setup.ground is not None and (contact.mode != "separate" or contact.restitution > 0 or contact.adhesion > 0):
         return "sticks to the ground or bounces off it"
     return None
+
+
+def new_quiet_matter(places: Sequence[WorldSlot], offsets: NDArray[np.int64], arch: str) -> QuietMatter | None:
+    """What chooses implicit steps for the worlds ``places``, None where these are not possible; the log says why."""
+    reason = why_explicit(places[0].setup) if len(places) == 1 else "there are several worlds"
+    if arch != "cpu":
+        reason = f"{arch} computes"
+    if reason is not None:
+        logger.info("explicit steps only: %s", reason)
+        return None
+    return QuietMatter(places[0], offsets)
 
 
 class QuietMatter:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 
@@ -23,7 +22,7 @@ from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, u
 from .kernels import layout, runtime
 from .kernels.lanes import lanes_of, windows_of
 from .kernels.time_stepping import RIGID_LOST
-from .quiet_matter import QuietMatter, why_explicit
+from .quiet_matter import new_quiet_matter
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
 from .solver_options import SolverOptions
@@ -31,8 +30,6 @@ from .world_setup import WorldSetup, check_start
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
-
-logger = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 2
 
@@ -96,7 +93,7 @@ class WorldGroup:
         self._fits: dict[int, FittedGradients] = {}
         self._followed: dict[int, DeformableMaterial] = {}
         self._shares: dict[int, ti.Ndarray] = {}
-        self._quiet_matter = self._new_quiet_matter()
+        self._quiet_matter = new_quiet_matter(self._places, self._offsets, self.arch) if self.options.implicit else None
         self._reach_times(np.full(len(self), -math.inf))
 
     def _new_rigid_bodies(self) -> RigidBodies:
@@ -120,18 +117,6 @@ class WorldGroup:
             lanes=lanes_of(self.arch),
             windows=windows_of(self.arch, self.options.threads),
         )
-
-    def _new_quiet_matter(self) -> QuietMatter | None:
-        """What chooses implicit steps, where they are asked for and possible; a line in the log says why not."""
-        if not self.options.implicit:
-            return None
-        reason = why_explicit(self.setups[0]) if len(self) == 1 else "there are several worlds"
-        if self.arch != "cpu":
-            reason = f"{self.arch} computes"
-        if reason is not None:
-            logger.info("explicit steps only: %s", reason)
-            return None
-        return QuietMatter(self._places[0], self._offsets)
 
     def __len__(self) -> int:
         return len(self.setups)

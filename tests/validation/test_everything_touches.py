@@ -57,6 +57,18 @@ def filled(name: str, material, places: np.ndarray, spacing: float, **fields) ->
     )
 
 
+def in_tub(bodies, side, cell, similarity, options):
+    """A world of ``bodies`` between slippery walls, ``side`` wide and 14 cells high, on slippery ground."""
+    return World(
+        bodies=bodies,
+        ground=Ground(friction=0.0),
+        colliders=walls((side, side), 14 * cell),
+        contacts=ContactTable(default=SurfaceContact(friction=0.0)),
+        similarity=similarity,
+        options=options,
+    )
+
+
 @pytest.mark.long
 def test_a_pond_in_a_tub_holds_its_level_and_comes_to_rest(similarity, options, cell):
     """Eight cells deep and wide, let go for 2 s: its level within 3 % of its depth, as the issue asks of its pressure,
@@ -68,14 +80,7 @@ def test_a_pond_in_a_tub_holds_its_level_and_comes_to_rest(similarity, options, 
     its surface, water next to floor and walls had half the pressure, circulated, and the gradient was 13 % short."""
     spacing, side, depth = cell / 2, 8 * cell, 8 * cell
     places = lattice((-side / 2, -side / 2, 0), (side / 2, side / 2, depth), spacing)
-    world = World(
-        bodies=[filled("water", WATER, places, spacing)],
-        ground=Ground(friction=0.0),
-        colliders=walls((side, side), 14 * cell),
-        contacts=ContactTable(default=SurfaceContact(friction=0.0)),
-        similarity=similarity,
-        options=options,
-    )
+    world = in_tub([filled("water", WATER, places, spacing)], side, cell, similarity, options)
     world.advance(2.0)
     at = world.positions(0)
     away = np.abs(at[:, :2]).max(axis=1) < side / 2 - 1.5 * cell
@@ -100,14 +105,7 @@ def test_disordered_water_keeps_its_level(similarity, options, cell):
     spacing, side, depth = cell / 2, 8 * cell, 8 * cell
     places = lattice((-side / 2, -side / 2, 0), (side / 2, side / 2, depth), spacing)
     places += np.random.default_rng(0).uniform(-0.3, 0.3, places.shape) * spacing
-    world = World(
-        bodies=[filled("water", WATER, places, spacing)],
-        ground=Ground(friction=0.0),
-        colliders=walls((side, side), 14 * cell),
-        contacts=ContactTable(default=SurfaceContact(friction=0.0)),
-        similarity=similarity,
-        options=options,
-    )
+    world = in_tub([filled("water", WATER, places, spacing)], side, cell, similarity, options)
     world.advance(0.1)
     assert world.positions(0)[:, 2].mean() > 1.1 * depth / 2, "it was thrown up"
     world.advance(0.9)
@@ -135,14 +133,7 @@ def floating(box_body, similarity, options, cell):
         block = box_body(
             name="block", center=(0.0, 0.0, bottom + height / 2), size=(side, side, height), density=density
         )
-        world = World(
-            bodies=[water, block],
-            ground=Ground(friction=0.0),
-            colliders=walls((tub, tub), 14 * cell),
-            contacts=ContactTable(default=SurfaceContact(friction=0.0)),
-            similarity=similarity,
-            options=options,
-        )
+        world = in_tub([water, block], tub, cell, similarity, options)
         world.advance(seconds)
         found = []
         for _ in range(10):

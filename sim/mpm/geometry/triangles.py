@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ...errors import InputError
 
@@ -275,6 +273,10 @@ def boundary(points: Array, triangles: Faces, oriented: bool, *, samples: int = 
     Oriented meshes are turned part by part; where faces are not consistently oriented, each face for itself.
     """
     first, second = triangles[:, 0], triangles[:, 1]
+    # Not at the top: Blender plays bakes without SciPy.
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     links = coo_matrix(
         (
             np.ones(2 * len(triangles), dtype=np.int8),

@@ -285,16 +285,23 @@ def scaled(F: mat3, squares: vec3, axes: mat3, stretch: vec3, kept: vec3):
 
 
 @func
+def relaxed_branch(p: ti.i32, row: ti.i32, dt: ti.f32, step: mat3, worlds: WorldArrays, particles: ParticleArrays):
+    """Strain of the branch that relaxes, of particle ``p`` of the material at ``row``, after ``dt`` in which the
+    displacements have the gradient ``step``."""
+    one = ti.Matrix.identity(ti.f32, 3)
+    kept = ti.exp(-dt / worlds.materials[row + RELAXATION_TIME])
+    return one + kept * (step @ particles.conformation[p] @ step.transpose() - one)
+
+
+@func
 def deform(laws: ti.template(), p: ti.i32, dt: ti.f32, C: mat3, worlds: WorldArrays, particles: ParticleArrays):
     """Deformation gradient of particle ``p`` after ``dt``; of fluids only the volume changes, in ``memory``."""
     Fp = particles.F[p]
     if ti.static(laws.relaxing):
         row = particles.material[p] * ROW
         if worlds.materials[row + RELAXING_SHARE] > 0.0:
-            one = ti.Matrix.identity(ti.f32, 3)
-            step = one + dt * C
-            kept = ti.exp(-dt / worlds.materials[row + RELAXATION_TIME])
-            particles.conformation[p] = one + kept * (step @ particles.conformation[p] @ step.transpose() - one)
+            step = ti.Matrix.identity(ti.f32, 3) + dt * C
+            particles.conformation[p] = relaxed_branch(p, row, dt, step, worlds, particles)
     if ti.static(len(laws.volumetric) > 0):
         law = law_of(p, worlds, particles)
         if is_fluid(law):

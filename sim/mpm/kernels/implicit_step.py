@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: ANN201, ANN202, SIM102
+# ruff: noqa: ANN201, ANN202
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple.)
 """What an implicit step asks of the particles: momentum, forces at the end of the step, their stiffness; and its end.
@@ -24,7 +24,7 @@ from typing import NamedTuple
 import taichi as ti
 
 from ...constitutive import ROW
-from .constitutive_response import RELAXATION_TIME, RELAXING_SHARE, law_set, own_numbers
+from .constitutive_response import RELAXATION_TIME, RELAXING_SHARE, law_set, own_numbers, relaxed_branch
 from .kernel_arrays import GridBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import BundledKernel, func, kernel
 from .lanes import SERIAL
@@ -249,14 +249,6 @@ def find_forces_of(laws: int) -> BundledKernel:
 
 
 @func
-def relaxed(p: ti.i32, dt: ti.f32, H: mat3, worlds: WorldArrays, particles: ParticleArrays):
-    """Strain of the branch that relaxes after a step with the gradient ``H``."""
-    kept = ti.exp(-dt / worlds.materials[particles.material[p] * ROW + RELAXATION_TIME])
-    one = ti.Matrix.identity(ti.f32, 3)
-    return one + kept * (H @ particles.conformation[p] @ H.transpose() - one)
-
-
-@func
 def stress_after(laws: ti.template(), p: ti.i32, dt: ti.f32, H: mat3, worlds: WorldArrays, particles: ParticleArrays):
     """Kirchhoff stress times volume of particle ``p`` after a step with the gradient ``H``."""
     fixed = particles.constants[p]
@@ -273,7 +265,7 @@ def stress_after(laws: ti.template(), p: ti.i32, dt: ti.f32, H: mat3, worlds: Wo
         if ti.static(laws.relaxing):
             share = worlds.materials[row + RELAXING_SHARE]
             if share > 0.0:
-                B = relaxed(p, dt, H, worlds, particles)
+                B = relaxed_branch(p, row, dt, H, worlds, particles)
                 for i in ti.static(range(3)):
                     B[i, i] -= 1.0
                 tau += (0.5 * share * fixed[1]) * B
@@ -418,8 +410,9 @@ def move_particles_of(laws: int) -> BundledKernel:
                         particles.C[p] = particles.C[p] @ H.inverse()
                         particles.F[p] = H @ particles.F[p]
                         if ti.static(models.relaxing):
-                            if worlds.materials[particles.material[p] * ROW + RELAXING_SHARE] > 0.0:
-                                particles.conformation[p] = relaxed(p, dt, H, worlds, particles)
+                            row = particles.material[p] * ROW
+                            if worlds.materials[row + RELAXING_SHARE] > 0.0:
+                                particles.conformation[p] = relaxed_branch(p, row, dt, H, worlds, particles)
                         particles.x[p] = ti.min(
                             ti.max(x + ti.floor(shift * FIXED_ONE + 0.5, ti.i32), FIXED_LOW), FIXED_HIGH
                         )

@@ -79,7 +79,9 @@ def circles_of_a_kind(pixels: Pixels) -> list[Circle]:
     covered = sum(np.pi * item.radius**2 for item in alike) / (size[0] * size[1])
     if len(alike) < FEWEST or covered < COVER:
         return []
-    return [Circle(item.x / scale, item.y / scale, item.radius / scale) for item in alike]
+    whole = [Circle(item.x / scale, item.y / scale, item.radius / scale) for item in alike]
+    # The copy's size is rounded, so that a middle at its border may lie outside of the photo.
+    return [item for item in whole if 0.0 <= item.x < width and 0.0 <= item.y < height]
 
 
 def round_things(pixels: Pixels, seen: Sequence[Proposal], least: float) -> list[Proposal]:

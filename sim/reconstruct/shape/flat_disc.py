@@ -80,7 +80,9 @@ def is_disc(pixels: NDArray[np.uint8], mask: Mask) -> bool:
     shares = [smooth_share(pixels, mask)]
     circles = circles_of_a_kind(pixels)
     if any(mask[int(item.y), int(item.x)] for item in circles):
-        rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]] + 0.5
         for item in circles[:MOST]:
-            shares.append(smooth_share(pixels, np.hypot(columns - item.x, rows - item.y) < item.radius))
+            low = np.maximum(np.floor(np.array([item.y, item.x]) - item.radius), 0).astype(int)
+            part = pixels[low[0] : math.ceil(item.y + item.radius), low[1] : math.ceil(item.x + item.radius)]
+            rows, columns = np.mgrid[: part.shape[0], : part.shape[1]] + 0.5 + low[:, None, None]
+            shares.append(smooth_share(part, np.hypot(columns - item.x, rows - item.y) < item.radius))
     return float(np.median(shares)) < SMOOTH

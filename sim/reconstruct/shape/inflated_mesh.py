@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...mpm.geometry.triangles import signed_volume
 from ...scene.model import Camera
 from .floor_limbs import with_limbs
 from .inflate import Silhouette
@@ -279,11 +280,6 @@ def standing_mesh(camera: Camera, pixels: Points, depth: Points, faces: Faces) -
     factor = position[2] / (position[2] - lowest)
     vertices = position + factor * (vertices - position)
     vertices[np.abs(vertices[:, 2]) < 1e-9 * position[2], 2] = 0.0
-    if _volume(vertices, faces) < 0:
+    if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1].copy()
     return BodyMesh(vertices=vertices, faces=faces, pixels=pixels)
-
-
-def _volume(vertices: Points, faces: Faces) -> float:
-    a, b, c = (vertices[faces[:, i]] - vertices.mean(axis=0) for i in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
