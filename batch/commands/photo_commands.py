@@ -12,7 +12,7 @@ from ...physgen_addon.frames.frame_index import INDEX_FILE
 from ...physgen_addon.render.render_options import require_video_name
 from ...sim.app.bake_options import BakeOptions
 from ...sim.app.default_motion import tells_motion
-from ...sim.app.propose import PICTURE_FILE, choose, propose
+from ...sim.app.propose import LEAST_CLEAR, PICTURE_FILE, choose, propose
 from ...sim.app.reconstruct import correct, reconstruct, require_physics
 from ...sim.app.reconstruct_record import require_request
 from ...sim.cache.bake_folder import load_bake
@@ -252,10 +252,11 @@ def use_found_boxes(
         if options.pick:
             raise InputError("--pick: chooses among objects that are found without a box; leave out one of the two")
         return
-    found = propose(options.photo, out=folder, segmenter=_finder(options), on_event=terminal, cancelled=cancelled)
+    finder = _finder(options)
+    found = propose(options.photo, out=folder, segmenter=finder, on_event=terminal, cancelled=cancelled)
     wanted = max(len(options.name), len(options.size), len(options.velocity), len(options.spin))
     wanted = max(wanted, len(options.preset) if len(options.preset) > 1 else 0)
-    chosen = choose(found, options.pick, wanted)
+    chosen = choose(found, options.pick, wanted, least_clear=LEAST_CLEAR if finder is None else 0.0)
     options.box = [item.box for item in (found[index] for index in chosen)]
     numbers = ", ".join(str(index + 1) for index in chosen)
     boxes = " ".join(box_text(box) for box in options.box)

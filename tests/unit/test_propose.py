@@ -210,6 +210,17 @@ def test_twenty_proposals_are_numbered_and_three_are_used():
     assert best_proposals([]) == []
 
 
+def test_a_lawn_is_not_cut_into_an_object_unless_the_user_says_so(tmp_path, capsys):
+    blades = np.random.default_rng(1).integers(0, 255, (400, 600, 3), dtype=np.uint8)
+    Image.fromarray(blades).save(tmp_path / "lawn.png")
+    found = propose(tmp_path / "lawn.png", out=tmp_path / "x_work" / "proposals")
+    assert found and found[0].score < propose_module.LEAST_CLEAR
+    assert main(["run", str(tmp_path / "lawn.png"), "--out", str(tmp_path / "x.mp4"), "--segmenter", "none"]) == 3
+    assert "--pick 1" in capsys.readouterr().err and not (tmp_path / "x.mp4").exists()
+    assert choose(found, [1], 0, least_clear=propose_module.LEAST_CLEAR) == [0]
+    assert choose(found, [], 1, least_clear=propose_module.LEAST_CLEAR) == [0]
+
+
 def test_a_photo_is_of_a_toy_and_not_of_the_skirting_behind_it():
     rows, columns = np.mgrid[:192, :256] + 0.5
     image = np.full((192, 256, 3), (150.0, 150, 160)) + np.random.default_rng(3).normal(scale=2, size=(192, 256, 1))
