@@ -122,7 +122,7 @@ def run_estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
     """Run ``physgen estimate``; the exit code."""
     # What prepares worlds, and below what bakes, takes a second to import, which the other commands need not pay.
     from ...sim.app.bake_estimate import bake_cost
-    from ...sim.app.scene_to_world import cost_text
+    from ...sim.app.scene_to_world import cost_text, steps_text
 
     folder = load_scene(options.scene)
     scene = with_physics(folder.model, physics_options(options))
@@ -131,6 +131,8 @@ def run_estimate(options: argparse.Namespace, terminal: Terminal, cancelled: IsC
         terminal({"event": "notice", "stage": "estimate", "message": warning})
     terminal({"event": "done", "stage": "estimate", **cost.to_json()})
     terminal.line(f"{cost_text(cost.prepared)}; {cost.disk_bytes / 2**20:.0f} MiB on disk")
+    if steps := steps_text(cost.prepared):
+        terminal.line(steps)
     cost.prepared.require_affordable()
     return 0
 

@@ -71,6 +71,13 @@ def add_bake_flags(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"jitter of the particle positions; 0: regular lattice (default {defaults.seed})",
     )
+    group.add_argument(
+        "--implicit",
+        action=argparse.BooleanOptionalAction,
+        default=defaults.implicit,
+        help="let stiff objects take long, implicit time steps while they fly, slide or rest "
+        f"(docs/simulation.md; default {'on' if defaults.implicit else 'off'})",
+    )
 
 
 def add_sample_flags(parser: argparse.ArgumentParser) -> None:
@@ -94,5 +101,5 @@ def physics_options(options: argparse.Namespace) -> Physics:
 
 def bake_options(options: argparse.Namespace) -> BakeOptions:
     """Return the options of the bake; defaults for flags that the verb does not have."""
-    names = ("frames", "fps", "slow", "quality", "arch", "seed", "space", "points")
+    names = ("frames", "fps", "slow", "quality", "arch", "seed", "space", "points", "implicit")
     return BakeOptions(**{name: value for name in names if (value := getattr(options, name, None)) is not None})

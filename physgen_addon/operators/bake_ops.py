@@ -96,7 +96,8 @@ def option_arguments(options: BakeOptions) -> list[str]:
         "--space",
         options.space,
     ]
-    return [*arguments, "--points" if options.points else "--no-points"]
+    arguments.append("--points" if options.points else "--no-points")
+    return [*arguments, "--implicit" if options.implicit else "--no-implicit"]
 
 
 class Bake(JobOperator):

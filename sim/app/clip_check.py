@@ -186,7 +186,15 @@ def rehearsal_options(motion: DefaultMotion, options: BakeOptions) -> BakeOption
     """Return the options of a coarse bake of ``motion`` in place of a bake with ``options``."""
     seconds = min(max(LONGER * motion.action_s, AT_LEAST_S), AT_MOST_S)
     frames = math.ceil(seconds * RATE) + 1
-    return BakeOptions(frames=frames, fps=RATE, quality=COARSEST, arch=options.arch, seed=options.seed, points=False)
+    return BakeOptions(
+        frames=frames,
+        fps=RATE,
+        quality=COARSEST,
+        arch=options.arch,
+        seed=options.seed,
+        points=False,
+        implicit=options.implicit,
+    )
 
 
 def rehearsed(

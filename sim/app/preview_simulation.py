@@ -206,7 +206,9 @@ def _only(scene: SceneModel, names: set[str]) -> SceneModel:
 
 
 def _faster(solver: SolverOptions) -> SolverOptions:
-    return dataclasses.replace(solver, max_step=MAX_STEP, cfl_elastic=CFL_ELASTIC, cfl_velocity=CFL_VELOCITY)
+    return dataclasses.replace(
+        solver, max_step=MAX_STEP, cfl_elastic=CFL_ELASTIC, cfl_velocity=CFL_VELOCITY, implicit=False
+    )
 
 
 def _softened(scene: SceneModel, prepared: PreparedWorld) -> tuple[SceneModel, list[str]]:

@@ -30,6 +30,7 @@ from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, sample_interior
+from ..mpm.implicit_choice import may_pay, why_explicit
 from ..mpm.solver_options import SolverOptions
 from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
 from ..mpm.world_setup import WorldSetup
@@ -184,6 +185,7 @@ class PreparedWorld:
     body_of_object, collider_of_object: for each object of the scene its place in ``setup``, or None.
     cost: of the whole bake, estimated for ``arch`` from ``stable_step``, ``duration``, s, and ``file_bytes``, of the
         largest mesh file.
+    explicit_because: why there are no implicit steps although they might pay, or None.
     """
 
     setup: WorldSetup
@@ -197,6 +199,7 @@ class PreparedWorld:
     duration: float
     arch: str
     file_bytes: int = 0
+    explicit_because: str | None = None
 
     @property
     def particle_count(self) -> int:
@@ -269,6 +272,9 @@ def prepare_world(
     )
     setup = apply_effects(setup, scene.effects)
     step = stable_step(setup.bodies, cell, solver)
+    explicit_because = why_explicit(setup)
+    stiff = options.implicit and may_pay(setup, step, cell)
+    solver = dataclasses.replace(solver, implicit=stiff and explicit_because is None)
     duration = (options.frames - 1) / options.rate
     count = _soft_count(setup)
     files = max(_file_bytes(folder, item) for item in scene.objects)
@@ -286,6 +292,7 @@ def prepare_world(
         duration=duration,
         arch=options.arch,
         file_bytes=files,
+        explicit_because=explicit_because if stiff else None,
     )
 
 
@@ -465,6 +472,15 @@ def cost_text(prepared: PreparedWorld) -> str:
         f"particles, {cost.substeps} time steps of {prepared.stable_step * 1e6:.0f} µs, cells of "
         f"{prepared.solver.cell_size(prepared.similarity) * 1000:.3g} mm"
     )
+
+
+def steps_text(prepared: PreparedWorld) -> str | None:
+    """Return what the bake will do about stiff matter as one line of text; None where there is none."""
+    if prepared.solver.implicit and prepared.arch == "cpu":
+        return "stiff objects take longer, implicit time steps while they fly, slide or rest, so it may be much less"
+    if prepared.explicit_because is not None and prepared.arch == "cpu":
+        return f"short time steps throughout, since {prepared.explicit_because}"
+    return None
 
 
 def _duration(seconds: float) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..events import StageProgress
 from ..mpm.world import World
-from .scene_to_world import PreparedWorld, cost_text, engine_material
+from .scene_to_world import PreparedWorld, cost_text, engine_material, steps_text
 from .scene_to_world_checks import moves, vertices_at
 
 __all__ = ["ENGINE_NAME", "Simulation", "build_world", "engine_material"]
@@ -79,6 +79,9 @@ def build_world(prepared: PreparedWorld, arch: str, progress: StageProgress) -> 
         progress.notice(warning)
     prepared.require_affordable()
     progress.notice(cost_text(prepared))
+    steps = steps_text(prepared)
+    if steps is not None:
+        progress.notice(steps)
     simulation = start_world(prepared)
     asleep = [body.name for i, body in enumerate(simulation.world.bodies) if simulation.world.asleep(i)]
     if asleep:

@@ -32,7 +32,7 @@ from .kernels.substep import REPEATS, rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
 from .rigid.rigid_bodies import RigidBodies
-from .rigid.rigid_motion import advance_bodies
+from .rigid.rigid_motion import advance_bodies, carry_colliders
 
 Array = NDArray[np.float64]
 State = dict[str, NDArray[np.generic]]
@@ -270,6 +270,10 @@ class Engine:
         state = self._download(("ids", "x"))
         return np.asarray(state["ids"], dtype=np.int32), _positions(state["keys"].astype(np.int64), state["x"])
 
+    def values(self, name: str) -> NDArray[np.generic]:
+        """The particles' array ``name``, in the order of ``places``."""
+        return np.asarray(self._particles[0][name].to_numpy()[: self.count])
+
     def _download(self, names: Sequence[str] | None = None) -> State:
         """The particles in engine order, all or those arrays, with the block key of each under "keys"."""
         n = self.count
@@ -432,12 +436,22 @@ class Engine:
         if self._implicit is None:
             self._implicit = ImplicitSteps(self.laws)
         blocks = self._blocks
+        rigid = self.rigid_bodies
         matter = Matter(
-            self._worlds(), blocks.particle_blocks, blocks.grid_blocks, self._particle_bundle(), blocks.nodes
+            worlds=self._worlds(),
+            blocks=blocks.particle_blocks,
+            grid=blocks.grid_blocks,
+            near=blocks.near_blocks,
+            particles=self._particle_bundle(),
+            nodes=blocks.nodes,
+            colliders=rigid.bodies,
+            shapes=rigid.shapes,
         )
         control = self.control()
         report = self._implicit.step(dt, gravity, most_hit, float(control[0, layout.WAVE_SPEED]), matter)
         if report.done:
+            if rigid.count:
+                carry_colliders.launch(dt, rigid.bodies)
             control[0, layout.SPEED] = report.speed
             control[0, layout.SUBSTEPS] += 1.0
             self._put_control(control)

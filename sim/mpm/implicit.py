@@ -5,7 +5,7 @@ Backward Euler in the deformation only. The rigid part of each body's motion, fo
 exactly: the centre of mass on its parabola, the angular momentum kept. The solver looks for what is left, a change v of
 the nodes' velocities after the rigid prediction u*,
 
-    M v = dt f(u* + dt v)          f: elasticity and the ground at the end of the step, see ``kernels.implicit_step``
+    M v = dt f(u* + dt v)          f: elasticity and surfaces at the end of the step, see ``kernels.implicit_step``
 
 so a body in free flight is not slowed down or stopped from turning by a long step, and has nothing to solve. Waves that
 the step does not resolve are damped, as backward Euler does. Whatever is left of the equation when the iteration ends
@@ -26,8 +26,17 @@ from scipy.spatial.transform import Rotation
 
 from .kernels import implicit_step
 from .kernels.implicit_step import FARTHEST, FASTEST, HIT, PRESSED, REPORT, ImplicitArrays
-from .kernels.kernel_arrays import GridBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
-from .kernels.layout import BLOCK_NODES, PLANE_NORMAL, SCALARS_PER_BLOCK, vec4
+from .kernels.kernel_arrays import (
+    GridBlocks,
+    NearBlocks,
+    NodeArrays,
+    ParticleArrays,
+    ParticleBlocks,
+    RigidArrays,
+    ShapeArrays,
+    WorldArrays,
+)
+from .kernels.layout import BLOCK_NODES, SCALARS_PER_BLOCK, vec4
 from .kernels.runtime import new_array
 
 Array = NDArray[np.float64]
@@ -49,7 +58,7 @@ MOST_HALVINGS = 4
 """Times at most that a step of Newton's method is tried at half its length because it did not help."""
 
 LEAST_SLIDING = 0.05
-"""Acceleration along the ground over gravity above which a body is expected to go on sliding."""
+"""Acceleration along a surface over gravity above which a body is expected to go on sliding."""
 
 FORCING = 0.1
 """Share of the residual that conjugate gradients leave."""
@@ -61,8 +70,11 @@ class Matter(NamedTuple):
     worlds: WorldArrays
     blocks: ParticleBlocks
     grid: GridBlocks
+    near: NearBlocks
     particles: ParticleArrays
     nodes: NodeArrays
+    colliders: RigidArrays
+    shapes: ShapeArrays
 
 
 @dataclass(frozen=True)
@@ -73,7 +85,7 @@ class StepReport:
     """Whether the particles have moved; if not, they are as they were."""
 
     hit: float = 0.0
-    """Largest speed at which matter that did not touch the ground before would have reached it."""
+    """Largest speed at which matter that touched no surface before would have reached one."""
 
     passes: int = 0
     """Passes over all particles."""
@@ -128,12 +140,14 @@ def rigid_part(m: Array, x: Array, v: Array) -> Rigid:
     arm = x - centre
     momentum = (m * np.cross(arm, v - velocity)).sum(axis=0)
     inertia = np.eye(3) * (m * arm * arm).sum() - (m[:, :, None] * arm[:, :, None] * arm[:, None, :]).sum(axis=0)
-    return Rigid(centre, velocity, momentum, inertia, np.linalg.solve(inertia, momentum))
+    # What lies on a line has no inertia about it.
+    spin = np.linalg.pinv(inertia, hermitian=True) @ momentum
+    return Rigid(centre, velocity, momentum, inertia, spin)
 
 
 class Prediction(NamedTuple):
     """A body after a step of its rigid motion: displacements (n, 3), that motion, the deforming velocities (n, 3) that
-    are left, turned along, and the acceleration (3,) along the ground that it slides with: 0 where it sticks, None in
+    are left, turned along, and the acceleration (3,) along a surface that it slides with: 0 where it sticks, None in
     flight."""
 
     shift: Array
@@ -147,7 +161,7 @@ class Prediction(NamedTuple):
 
     def restored(self, m: Array, x: Array, left: Array) -> Array:
         """Velocities (n, 3) with the momentum that the solver has ``left`` over: in flight of a rigid motion, in
-        sliding of one along the way. What sticks to the ground has given it away."""
+        sliding of one along the way. What sticks to a surface has given it away."""
         if self.sliding is None:
             return rigid_part(m, x, left / m).at(x)
         size = float(self.sliding @ self.sliding)
@@ -158,7 +172,7 @@ class Prediction(NamedTuple):
 def predict(m: Array, x: Array, v: Array, gravity: Array, dt: float, *, support: Array | None) -> Prediction:
     """Prediction for a body of masses (n, 1) at (n, 3) with velocities (n, 3), which nothing but gravity acts on.
 
-    Falling for dt s it covers g dt²/2; with a ``support`` (3,), the acceleration that the ground may give it, g dt², so
+    Falling for dt s it covers g dt²/2; with a ``support`` (3,), the acceleration that surfaces may give it, g dt², so
     that the same change of velocity cancels fall and speed; where it slides, the way is that of the mean speed, too.
     """
     sliding = None if support is None else gravity + support
@@ -208,6 +222,8 @@ class ImplicitSteps:
             motion=new_array(vec4, nodes),
             found=new_array(vec4, nodes),
             contact=new_array(vec4, particles),
+            surface=new_array(vec4, particles),
+            carried=new_array(vec4, particles),
             report=new_array(ti.f32, blocks * REPORT),
         )
         self._host = np.zeros((nodes, 4), dtype=np.float32)
@@ -249,6 +265,16 @@ class ImplicitSteps:
         momentum = self._arrays.found.to_numpy()[: matter.grid.count * BLOCK_NODES].astype(np.float64)
         nodes = Nodes(matter, momentum)
         self._host[:] = 0.0
+        implicit_step.find_surfaces.launch(
+            dt,
+            matter.worlds,
+            matter.blocks,
+            matter.near,
+            matter.particles,
+            matter.colliders,
+            matter.shapes,
+            self._arrays,
+        )
         parts = {
             field: predict(nodes.m[s], nodes.x[s], nodes.v[s], gravity, dt, support=None)
             for field, s in nodes.spans.items()
@@ -280,17 +306,23 @@ class ImplicitSteps:
         return self._finish(dt, parts, start, *solved, matter, nodes)
 
     def _support(self, field: int, gravity: Array, matter: Matter) -> Array:
-        """Acceleration (3,) that the ground gives to the body ``field`` if it carries the weight and rubs as in the
-        step before: for what rests or slides, the solution. What hardly slides is taken to stick, since stiff springs
-        hold it then."""
+        """Acceleration (3,) that surfaces give to the body ``field`` if they carry the weight and rub as in the step
+        before: for what rests or slides, the solution. What hardly slides is taken to stick, since stiff springs hold
+        it then."""
         starts = matter.blocks.starts.to_numpy()[: matter.blocks.count + 1]
         mine = np.repeat(matter.blocks.field.to_numpy()[: matter.blocks.count] == field, np.diff(starts))
-        masses = matter.particles.constants.to_numpy()[: starts[-1], 0][mine].astype(np.float64)
-        forces = masses @ matter.particles.reaction.to_numpy()[: starts[-1], :3][mine].astype(np.float64)
-        normal = matter.worlds.numbers.to_numpy()[PLANE_NORMAL : PLANE_NORMAL + 3].astype(np.float64)
-        along = gravity + forces / masses.sum()
-        along -= (along @ normal) * normal
-        slides = forces.any() and float(np.linalg.norm(along)) > LEAST_SLIDING * float(np.linalg.norm(gravity))
+        masses, past, normals = (
+            array.to_numpy()[: starts[-1]][mine].astype(np.float64)
+            for array in (matter.particles.constants, matter.particles.reaction, self._arrays.surface)
+        )
+        forces, normals = masses[:, :1] * past[:, :3], normals[:, :3]
+        pressing = ((forces * normals).sum(axis=1, keepdims=True) * normals).sum(axis=0)
+        size = float(np.linalg.norm(pressing))
+        if size == 0.0:
+            return np.asarray(-gravity)
+        along = gravity + forces.sum(axis=0) / masses[:, 0].sum()
+        along -= (along @ pressing) / size**2 * pressing
+        slides = float(np.linalg.norm(along)) > LEAST_SLIDING * float(np.linalg.norm(gravity))
         return np.asarray(along - gravity if slides else -gravity)
 
     def _solve_step(

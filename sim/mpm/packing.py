@@ -18,7 +18,8 @@ from .bodies import THIN_CELLS, BodyParticles
 from .kernels import layout
 from .kernels.adhesion import LEAST_REACH, MOST_REACH
 from .kernels.particle_transfer import GOAL, PIN
-from .rigid.rigid_bodies import LEAST_RECOVERY, RECOVERY_HEIGHT
+from .rigid.rigid_bodies import LEAST_RECOVERY
+from .rigid.rigid_layout import RECOVERY_HEIGHT
 from .surface_contact import GROUND_NAME, MODES, SurfaceContact
 from .world_setup import WorldSetup
 

@@ -19,31 +19,19 @@ from numpy.typing import NDArray
 
 from ..events import IsCancelled
 from ..rigid_alignment import nearest_pose
-from .bodies import NO_FORCES, BodyParticles
 from .engine import Diverged, Engine, Stopped
 from .implicit import rigid_part
+from .implicit_choice import PAYS, longest_step, why_explicit
 from .kernels import layout
-from .packing import WorldSlot, materials_of
-from .surface_contact import GROUND_NAME
-from .world_setup import WorldSetup
+from .packing import WorldSlot
 
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-LAWS = ("fixed_corotated", "neo_hookean")
-"""Laws that implicit steps know."""
-
 BURST = 64
 """Explicit substeps that are taken at a time where matter is not quiet: some three passages of a wave through a body
 of eight cells."""
-
-PAYS = 24.0
-"""Explicit substeps that an implicit step has to replace, before it is known what it costs: at rest it takes 4 to 10
-passes over the particles, in flight 3 to 13, where it slides or begins to carry a load many more."""
-
-LONGEST = 4e-3
-"""Seconds of an implicit step at most."""
 
 FARTHEST = 0.4
 """Cells that matter may move in an implicit step."""
@@ -55,42 +43,7 @@ MOST_BENT = 0.05
 """Cells, r.m.s., by which a quiet body may differ in shape from its rest: what an implicit step may damp."""
 
 MOST_LOAD = 2.0
-"""Force of the ground over the weight of a quiet body at most: more is an impact."""
-
-
-def why_explicit(setup: WorldSetup) -> str | None:
-    """Why a world can take explicit steps only, in a few words; None if it can take implicit ones."""
-    if any(body.rigid for body in setup.bodies) or setup.colliders:
-        return "there are rigid bodies or colliders"
-    if setup.gravity_track is not None:
-        return "gravity changes"
-    for body in setup.bodies:
-        reason = _why_body(body) or _why_contact(setup, body)
-        if reason is not None:
-            return f"{body.name!r} {reason}"
-    return None
-
-
-def _why_body(body: BodyParticles) -> str | None:
-    for material in materials_of(body):
-        if material.law not in LAWS:
-            return f"is of {material.law}"
-        if material.fibre_modulus > 0 or material.damping_time > 0:
-            return "has fibres or damping"
-    if body.material_track or body.parameter_tracks:
-        return "changes its material"
-    if body.forces != NO_FORCES or body.acceleration is not None or body.velocity_keys is not None:
-        return "is driven"
-    if body.pins is not None or body.goal_stiffness > 0:
-        return "is held"
-    return None
-
-
-def _why_contact(setup: WorldSetup, body: BodyParticles) -> str | None:
-    contact = setup.contact(body.name, GROUND_NAME)
-    if setup.ground is not None and (contact.mode != "separate" or contact.restitution > 0 or contact.adhesion > 0):
-        return "sticks to the ground or bounces off it"
-    return None
+"""Force of surfaces over the weight of a quiet body at most: more is an impact."""
 
 
 def new_quiet_matter(places: Sequence[WorldSlot], offsets: NDArray[np.int64], arch: str) -> QuietMatter | None:
@@ -110,20 +63,23 @@ class QuietMatter:
     def __init__(self, place: WorldSlot, offsets: NDArray[np.int64]) -> None:
         """offsets: number of the first particle of each body, and of all."""
         self._offsets = offsets
-        self._bodies = place.setup.bodies
-        self._rest = [place.cells.points_to_engine(body.positions) for body in self._bodies]
+        self._rest = [place.cells.points_to_engine(body.positions) for body in place.setup.bodies]
         self._gravity = np.asarray(place.setup.gravity_at(0.0)) * place.cells.scale
         self._pull = float(np.linalg.norm(self._gravity))
-        ground = place.setup.ground
-        self._normal = np.zeros(3) if ground is None else np.asarray(ground.unit_normal)
+        self._collider_speed = 0.0
         self.steps = self.passes = 0
         """Implicit steps so far, and the passes over all particles that they took."""
 
     def advance(self, engine: Engine, duration: float, longest_step: float, stop: IsCancelled, most_hit: float) -> None:
         """Advance ``engine`` by ``duration`` s as ``Engine.advance`` does.
 
-        most_hit: speed in cells/s below which matter that comes to the ground need not bounce.
+        most_hit: speed in cells/s below which matter that comes to a surface need not bounce.
         """
+        if engine.rigid_bodies.count:
+            if engine.rigid_bodies.awake():
+                engine.advance(np.array([duration]), longest_step=np.array([longest_step]), stop=stop)
+                return
+            self._collider_speed = engine.rigid_bodies.collider_speed()
         left = duration
         while left > 0:
             wasted = 0
@@ -143,23 +99,21 @@ class QuietMatter:
 
     def _longest(self, engine: Engine, most_hit: float) -> float:
         """Longest implicit step in s that the motion allows."""
-        speed = float(engine.control()[0, layout.SPEED])
-        step = min(LONGEST, 0.5 * most_hit / max(self._pull, 1e-12))
+        speed = max(float(engine.control()[0, layout.SPEED]), self._collider_speed)
+        step = longest_step(most_hit, self._pull)
         # The speed at the end of the step, falling.
         return min(step, FARTHEST / max(speed + self._pull * step, 1e-12))
 
     def _quiet(self, engine: Engine, most_hit: float) -> bool:
-        state = engine.state()
-        order = np.argsort(np.asarray(state["ids"]))
-        ids = np.asarray(state["ids"])[order]
-        x = np.asarray(state["position"], dtype=np.float64)[order]
-        v = np.asarray(state["v"], dtype=np.float64)[order]
-        a = np.asarray(state["reaction"], dtype=np.float64)[order, :3]
-        m = np.asarray(state["constants"], dtype=np.float64)[order, :1]
+        """Whether every body is."""
+        ids, x = engine.places()
+        v, a, constants = (engine.values(name).astype(np.float64) for name in ("v", "reaction", "constants"))
         for i, rest in enumerate(self._rest):
-            low, high = np.searchsorted(ids, (self._offsets[i], self._offsets[i + 1]))
-            if high > low and not self._is_quiet(x[low:high], v[low:high], a[low:high], m[low:high], rest, most_hit):
-                return False
+            mine = (ids >= self._offsets[i]) & (ids < self._offsets[i + 1])
+            if mine.any():
+                at_rest = rest[ids[mine] - self._offsets[i]]
+                if not self._is_quiet(x[mine], v[mine], a[mine, :3], constants[mine, :1], at_rest, most_hit):
+                    return False
         return True
 
     def _is_quiet(self, x: Array, v: Array, a: Array, m: Array, rest: Array, most_hit: float) -> bool:
@@ -169,7 +123,7 @@ class QuietMatter:
         bent = x - rest @ rotation.T - translation
         if float(np.sqrt((bent**2).sum(axis=1).mean())) > MOST_BENT:
             return False
-        load = float((m * a).sum(axis=0) @ self._normal)
+        load = float(np.linalg.norm((m * a).sum(axis=0)))
         if load > MOST_LOAD * float(m.sum()) * self._pull:
             return False
         if load == 0.0:
@@ -189,7 +143,7 @@ class QuietMatter:
             longest = self._longest(engine, most_hit)
             dt = left / math.ceil(left / longest - 1e-6)
             # In a step of gravity alone.
-            ahead = (float(engine.control()[0, layout.SPEED]) + self._pull * dt) * dt
+            ahead = (float(engine.control()[0, layout.SPEED]) + self._pull * dt + self._collider_speed) * dt
             if drift + ahead > DRIFT:
                 engine.begin_implicit()
                 drift = 0.0
@@ -201,7 +155,7 @@ class QuietMatter:
                 wasted = report.passes
                 break
             self.steps += 1
-            drift += report.farthest
+            drift += report.farthest + self._collider_speed * dt
             left = left - dt if left > 1.5 * dt else 0.0
             if report.passes * explicit > dt:
                 wasted = report.passes

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.constitutive import NeoHookeanMaterial, SandMaterial
 from physgen.sim.mpm.bodies import BodyParticles
-from physgen.sim.mpm.quiet_matter import why_explicit
+from physgen.sim.mpm.implicit_choice import why_explicit
 from physgen.sim.mpm.solver_options import Ground, SolverOptions
 from physgen.sim.mpm.world import World
 from physgen.sim.mpm.world_setup import WorldSetup

@@ -281,7 +281,12 @@ _RENDER_FLAGS = [word for _, flag, _ in flagged_fields() for word in (flag, f"--
 FLAGS: Mapping[str, frozenset[str]] = {
     "reconstruct": frozenset(("--out", "--box", "--name", "--size", "--horizon", "--pitch", "--fov")),
     "variant": frozenset(("--out", "--preset", "--velocity", "--spin", "--set", "--effects-json")),
-    "bake": frozenset(("--out", "--frames", "--fps", "--quality", "--arch", "--seed", "--no-points", "--slow")),
+    "bake": frozenset(
+        (
+            *("--out", "--frames", "--fps", "--quality", "--arch", "--seed", "--slow"),
+            *("--no-points", "--implicit", "--no-implicit"),
+        )
+    ),
     "render": frozenset(("--out", "--bake", "--frames", *_RENDER_FLAGS)),
     "encode": frozenset(("--out", "--fps")),
     "effects": frozenset(),

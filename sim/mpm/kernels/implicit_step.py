@@ -11,9 +11,10 @@ F' = H F at the end of the step (backward Euler, as Stomakhin et al. 2013 and Ga
     H = 1 + 4 sum_i w_ip u_i d^T          f_i = - sum_p 4 w_ip tau_p(H F) H^-T d
     K: stiffness of f, taken as that of isotropic matter of small strain, hence symmetric and positive definite
 
-The ground pushes particles by springs, as stiff as half a cell of the matter, that start from the contact forces of
-the step before, so that what rests stays where it is; friction is a spring along the ground that yields at Coulomb's
-limit.
+The ground and colliders push particles by springs, as stiff as half a cell of the matter, that start from the contact
+forces of the step before, so that what rests stays where it is; friction is a spring along the surface that yields at
+Coulomb's limit. Of the surfaces around a particle the nearest counts, as the plane that touches it there, which moves
+along with the collider.
 
 Kernels of a CPU: a thread takes a block and its window, as in ``particle_transfer``.
 """
@@ -24,12 +25,24 @@ from typing import NamedTuple
 import taichi as ti
 
 from ...constitutive import ROW
+from ..rigid.rigid_layout import STATE, V, W, X
+from .collider_distance import body_distance, single3
 from .constitutive_response import RELAXATION_TIME, RELAXING_SHARE, law_set, own_numbers, relaxed_branch
-from .kernel_arrays import GridBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
+from .kernel_arrays import (
+    GridBlocks,
+    NearBlocks,
+    NodeArrays,
+    ParticleArrays,
+    ParticleBlocks,
+    RigidArrays,
+    ShapeArrays,
+    WorldArrays,
+)
 from .kernel_bundles import BundledKernel, func, kernel
 from .lanes import SERIAL
 from .layout import (
     FIELD_INTEGERS,
+    FIRST_RIGID_BODY,
     FIRST_TOUCH,
     FIXED_HIGH,
     FIXED_LOW,
@@ -37,6 +50,7 @@ from .layout import (
     HAS_PLANE,
     PLANE_NORMAL,
     PLANE_OFFSET,
+    RIGID_BODIES,
     SLIDING,
     SPREAD,
     STICKING,
@@ -53,23 +67,30 @@ from .layout import (
 from .windows import add_to, clear_window, first_of, interpolate, load_window, spread, sum_windows, turns, weights
 
 CONTACT_STIFFNESS = 4.0
-"""Stiffness of the spring between a particle and the ground over (2 mu + lambda) V0, per cell²: of a particle's share
+"""Stiffness of the spring between a particle and a surface over (2 mu + lambda) V0, per cell²: of a particle's share
 of the surface, a quarter of a cell², half a cell of the matter has this."""
 
 FREE = -1.0
-"""State of a particle that the ground does not push; of one that it pushes, the share of the spring along the ground
-that friction bears, 1 where it sticks."""
+"""State of a particle that no surface pushes; of one that is pushed, the share of the spring along the surface that
+friction bears, 1 where it sticks."""
 
 HIT, PRESSED, FASTEST, FARTHEST = range(4)
-"""Numbers that a block reports: largest speed (cells/s) at which a particle that did not touch reaches the ground, sum
-of the forces on the ground (kg cells/s²); largest |v|² (cells²/s²) and largest displacement (cells) of a particle."""
+"""Numbers that a block reports: largest speed (cells/s) at which a particle that did not touch reaches a surface, or
+one that did is met by a collider; sum of the forces on surfaces (kg cells/s²); largest |v|² (cells²/s²) and largest
+displacement (cells) of a particle."""
 
 REPORT = 4
 
-
 CLOSE = 1e-4
-"""Cells from the ground within which a particle counts as touching it for the solver, which else would let what stands
+"""Cells from a surface within which a particle counts as touching it for the solver, which else would let what stands
 on it fall first."""
+
+CENTRING = 0.1
+"""Share of its gap by which a particle that a collider pushes is brought back to the surface in a step: where that is
+round, what slides along its tangent plane leaves it."""
+
+REACH = 2.0
+"""Cells from a surface within which particles may come to touch it."""
 
 YIELDING = 0.5
 """Share of the secant stiffness of friction that slides which the solver counts with: with all of it, as iteratively
@@ -89,7 +110,13 @@ class ImplicitArrays(NamedTuple):
     """(G, BLOCK_NODES) what a kernel sums up at the nodes."""
 
     contact: Vectors4
-    """(N,) force of the ground on a particle at the end of the step (kg cells/s²), and the state of the contact."""
+    """(N,) force of a surface on a particle at the end of the step (kg cells/s²), and the state of the contact."""
+
+    surface: Vectors4
+    """(N,) normal of the nearest surface, and how far it is from the particle at the beginning (cells)."""
+
+    carried: Vectors4
+    """(N,) displacement of that surface over the step (cells), and its row of contacts."""
 
     report: Scalars
     """(P, REPORT)"""
@@ -161,22 +188,71 @@ def ground_of(k: ti.i32, worlds: WorldArrays, blocks: ParticleBlocks):
     return normal, level
 
 
+@kernel
+def find_surfaces(
+    dt: ti.f32,
+    worlds: WorldArrays,
+    blocks: ParticleBlocks,
+    near: NearBlocks,
+    particles: ParticleArrays,
+    bodies: RigidArrays,
+    shapes: ShapeArrays,
+    arrays: ImplicitArrays,
+):
+    """The surface nearest to each particle, ``surface``, and its displacement over ``dt``, ``carried``."""
+    for kk in range(blocks.count * SPREAD):
+        if kk % SPREAD == 0:
+            k = kk // SPREAD
+            plane, level = ground_of(k, worlds, blocks)
+            first_touch = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH]
+            first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
+            first = worlds.integers[FIRST_RIGID_BODY]
+            colliders = ti.select(near.slot[k] >= 0, worlds.integers[RIGID_BODIES], 0)
+            for p in range(blocks.starts[k], blocks.starts[k + 1]):
+                here, _, _ = place_of(particles.x[p])
+                radius = particles.constants[p][3]
+                gap, normal, moved, row = level + plane.dot(here) - radius, plane, vec3(0.0), first_touch * TOUCH_ROW
+                for o in range(colliders):
+                    distance, along, _ = body_distance(first + o, first_node + here, REACH + radius, bodies, shapes)
+                    if distance - radius < gap:
+                        start = (first + o) * STATE
+                        arm = first_node + here - single3(bodies.state, start + X)
+                        moved = dt * (single3(bodies.state, start + V) + single3(bodies.state, start + W).cross(arm))
+                        gap, normal, row = distance - radius, along, (first_touch + o + 1) * TOUCH_ROW
+                arrays.surface[p] = vec4(normal[0], normal[1], normal[2], gap)
+                arrays.carried[p] = vec4(moved[0], moved[1], moved[2], ti.cast(row, ti.f32))
+
+
+@func
+def contact_stiffness(p: ti.i32, particles: ParticleArrays):
+    """Of the spring between particle ``p`` and a surface, kg/s²."""
+    return CONTACT_STIFFNESS * (particles.constants[p][1] + particles.constants[p][2])
+
+
 @func
 def pushed(
-    p: ti.i32, touch: ti.i32, gap: ti.f32, normal: vec3, shift: vec3, worlds: WorldArrays, particles: ParticleArrays
+    p: ti.i32,
+    touch: ti.i32,
+    is_ground: ti.i32,
+    gap: ti.f32,
+    normal: vec3,
+    shift: vec3,
+    worlds: WorldArrays,
+    particles: ParticleArrays,
 ):
-    """Force of the ground (kg cells/s²) on particle ``p``, ``gap`` cells away before it moves by ``shift``, and the
-    state of the contact."""
-    fixed = particles.constants[p]
+    """Force of a surface (kg cells/s²) on particle ``p``, ``gap`` cells away before the particle moves by ``shift``
+    against it, and the state of the contact."""
     past = particles.reaction[p]
-    before = fixed[0] * vec3(past[0], past[1], past[2])
-    stiffness = CONTACT_STIFFNESS * (fixed[1] + fixed[2])
+    before = particles.constants[p][0] * vec3(past[0], past[1], past[2])
+    stiffness = contact_stiffness(p, particles)
     along = shift.dot(normal)
     pressed = before.dot(normal)
-    # A contact goes on from where it is; a new one begins at the ground.
+    # A contact goes on from where it is; a new one begins at the surface.
     moved = along
     if pressed <= 0.0:
         moved += ti.max(gap, 0.0)
+    elif not is_ground:
+        moved += CENTRING * gap
     trial = pressed - stiffness * moved
     pressing = ti.max(0.0, trial)
     force = pressing * normal
@@ -208,8 +284,8 @@ def find_forces_of(laws: int) -> BundledKernel:
         nodes: NodeArrays,
         arrays: ImplicitArrays,
     ):
-        """Forces (kg cells/s²) on the nodes after the displacements ``given``, with those of the ground, which are
-        kept in ``contact``."""
+        """Forces (kg cells/s²) on the nodes after the displacements ``given``, with those of surfaces, which are kept
+        in ``contact``."""
         for kk in range(turns(SERIAL, blocks.count, nodes.window) * SPREAD):
             if kk % SPREAD == 0:
                 turn, all_turns = kk // SPREAD, turns(SERIAL, blocks.count, nodes.window)
@@ -218,26 +294,30 @@ def find_forces_of(laws: int) -> BundledKernel:
                     load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
                     offset = k * WINDOW_NODES
                     clear_window(SERIAL, 0, offset, nodes.scattered)
-                    normal, level = ground_of(k, worlds, blocks)
-                    touch = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH] * TOUCH_ROW
+                    ground = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH] * TOUCH_ROW
                     hit, sum_pressed = 0.0, 0.0
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                        here, base, fx = place_of(particles.x[p])
+                        _, base, fx = place_of(particles.x[p])
                         window_node = first_of(base, nodes.window)
-                        fixed = particles.constants[p]
                         shift, H = value_and_gradient(spot + window_node, fx, nodes.window)
                         for r in ti.static(range(3)):
                             H[r, r] += 1.0
                         tau = stress_after(models, p, dt, H, worlds, particles)
                         force = vec3(0.0)
                         state = FREE
-                        gap = level + normal.dot(here) - fixed[3]
-                        if gap < 2.0:
+                        surface = arrays.surface[p]
+                        gap = surface[3]
+                        if gap < REACH:
+                            normal = vec3(surface[0], surface[1], surface[2])
+                            carried = arrays.carried[p]
+                            touch = ti.cast(carried[3], ti.i32)
+                            relative = shift - vec3(carried[0], carried[1], carried[2])
                             past = particles.reaction[p]
-                            force, state = pushed(p, touch, gap, normal, shift, worlds, particles)
+                            is_ground = touch == ground
+                            force, state = pushed(p, touch, is_ground, gap, normal, relative, worlds, particles)
                             sum_pressed += force.dot(normal)
-                            if past.norm_sqr() == 0.0 and gap + shift.dot(normal) < 0.0:
-                                hit = ti.max(hit, -shift.dot(normal) / dt)
+                            if (past.norm_sqr() == 0.0 or not is_ground) and gap + relative.dot(normal) < 0.0:
+                                hit = ti.max(hit, -relative.dot(normal) / dt)
                         arrays.contact[p] = vec4(force[0], force[1], force[2], state)
                         Q = -4.0 * tau @ H.inverse().transpose()
                         spread_linear(offset + window_node, fx, force, Q, 0.0, nodes.scattered)
@@ -308,7 +388,6 @@ def multiply_stiffness_of(laws: int) -> BundledKernel:
                     load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
                     offset = k * WINDOW_NODES
                     clear_window(SERIAL, 0, offset, nodes.scattered)
-                    normal, _level = ground_of(k, worlds, blocks)
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
                         _, base, fx = place_of(particles.x[p])
                         window_node = first_of(base, nodes.window)
@@ -320,8 +399,9 @@ def multiply_stiffness_of(laws: int) -> BundledKernel:
                         force = vec3(0.0)
                         state = arrays.contact[p][3]
                         if state != FREE:
-                            fixed = particles.constants[p]
-                            spring = CONTACT_STIFFNESS * (fixed[1] + fixed[2])
+                            spring = contact_stiffness(p, particles)
+                            surface = arrays.surface[p]
+                            normal = vec3(surface[0], surface[1], surface[2])
                             # What slides counts as held by a weaker spring (iteratively reweighted least squares).
                             along = shift.dot(normal)
                             force = spring * (state * shift + (1.0 - state) * along * normal)
@@ -346,7 +426,7 @@ def find_diagonal_of(laws: int) -> BundledKernel:
         nodes: NodeArrays,
         arrays: ImplicitArrays,
     ):
-        """Diagonal of K (kg/s²), without contacts."""
+        """Diagonal of K (kg/s²); contacts are in the state that ``find_forces`` has found last."""
         for kk in range(blocks.count * SPREAD):
             if kk % SPREAD == 0:
                 k = kk // SPREAD
@@ -355,15 +435,27 @@ def find_diagonal_of(laws: int) -> BundledKernel:
                 for p in range(blocks.starts[k], blocks.starts[k + 1]):
                     _, base, fx = place_of(particles.x[p])
                     two_mu, lam = moduli(models, p, dt, worlds, particles)
+                    spring = vec3(0.0)
+                    state = arrays.contact[p][3]
+                    if state != FREE:
+                        surface = arrays.surface[p]
+                        for c in ti.static(range(3)):
+                            spring[c] = contact_stiffness(p, particles) * (
+                                state + (1.0 - state) * surface[c] * surface[c]
+                            )
                     w3 = weights(fx)
                     first = offset + first_of(base, nodes.scattered)
                     for i, j, m in ti.static(ti.ndrange(3, 3, 3)):
-                        w = 4.0 * w3[i][0] * w3[j][1] * w3[m][2]
-                        d = w * (vec3(float(i), float(j), float(m)) - fx)
+                        w = w3[i][0] * w3[j][1] * w3[m][2]
+                        d = 4.0 * w * (vec3(float(i), float(j), float(m)) - fx)
+                        held = w * w * spring
                         across = 0.5 * two_mu * d.norm_sqr()
                         more = 0.5 * two_mu + lam
                         share = vec4(
-                            across + more * d[0] * d[0], across + more * d[1] * d[1], across + more * d[2] * d[2], 0.0
+                            across + more * d[0] * d[0] + held[0],
+                            across + more * d[1] * d[1] + held[1],
+                            across + more * d[2] * d[2] + held[2],
+                            0.0,
                         )
                         add_to(nodes.scattered, first + (i * 64 + j * 8 + m), share)
         sum_nodes(grid, nodes, arrays)

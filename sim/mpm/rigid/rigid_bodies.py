@@ -28,9 +28,6 @@ from .surface_motion import Footing, footing_of
 
 Array = NDArray[np.float64]
 
-RECOVERY_HEIGHT = 0.02
-"""Cells that a body which starts in another could fly up if the position correction were kept as velocity."""
-
 LEAST_RECOVERY = 1.0
 """Speed of that correction without gravity, cells/s."""
 
@@ -352,7 +349,7 @@ class RigidBodies:
                 raise InputError(f"world is {w}: give 0 to {len(self.setups) - 1}")
             gravity = np.asarray(self.setups[w].gravity_at(0.5 * (start + end))) * self.scales[w]
             world[w, at.GRAVITY : at.GRAVITY + 3] = gravity
-            flight = math.sqrt(2 * RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
+            flight = math.sqrt(2 * at.RECOVERY_HEIGHT * float(np.linalg.norm(gravity)))
             world[w, at.RECOVERY] = max(flight, LEAST_RECOVERY)
         kinds, numbers = self._get("solid_kinds", at.KINDS), self._get("solid_numbers", at.NUMBERS)
         state = self._get("solids", at.STATE)
@@ -455,6 +452,18 @@ class RigidBodies:
                 each(self.bodies, *([self.shapes] if "shapes_points" in each.arguments else []), self.contacts)
 
     # ---- state --------------------------------------------------------------------------------------------------
+
+    def awake(self) -> bool:
+        """Whether a rigid body of any world moves or may be moved."""
+        return bool((self._get("solid_kinds", at.KINDS)[: self.count, at.KIND] == at.DYNAMIC).any())
+
+    def collider_speed(self) -> float:
+        """Speed in cells/s that no point of a collider of any world exceeds."""
+        moves = self._get("solid_kinds", at.KINDS)[: self.count, at.KIND] == at.KINEMATIC
+        state = self._get("solids", at.STATE)[: self.count][moves]
+        radius = self._get("solid_numbers", at.NUMBERS)[: self.count][moves, at.RADIUS]
+        speed = np.linalg.norm(state[:, at.V : at.V + 3], axis=1)
+        return float((speed + radius * np.linalg.norm(state[:, at.W : at.W + 3], axis=1)).max(initial=0.0))
 
     def _get(self, name: str, stride: int) -> NDArray[np.generic]:
         return self.arrays[name].to_numpy().reshape(-1, stride)

@@ -9,6 +9,9 @@ Imports no Taichi.
 WAITING, DYNAMIC, KINEMATIC, STATIC = -1, 0, 1, 2
 """Types of bodies; one that waits for its start time stays in place and touches nothing."""
 
+RECOVERY_HEIGHT = 0.02
+"""Cells that a body which starts in another could fly up if the position correction were kept as velocity."""
+
 # ---- per body, changing: ``solids`` f64 --------------------------------------------------------------------------
 STATE = 64
 """Stride."""

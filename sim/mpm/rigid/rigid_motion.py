@@ -268,6 +268,16 @@ def rigid_substep(*, together: bool) -> list[BundledKernel]:
 
 
 @kernel
+def carry_colliders(dt: ti.f64, bodies: RigidArrays):
+    """Colliders that move to the end of a step of ``dt`` s, in which no rigid body does."""
+    ti.loop_config(serialize=True)
+    for w in range(bodies.world_count):
+        for i in range(bodies.spans[w * SPANS], bodies.spans[w * SPANS + 1]):
+            if bodies.kinds[i * KINDS + KIND] == KINEMATIC:
+                move(w, i, dt, bodies)
+
+
+@kernel
 def advance_bodies(
     limits: StepLimits, worlds: WorldArrays, bodies: RigidArrays, shapes: ShapeArrays, contacts: RigidContacts
 ):
