@@ -44,6 +44,35 @@ def test_bottle_whose_foot_is_hidden_is_carried_on_but_not_through_the_table():
     assert np.flatnonzero(hidden.any(axis=1))[-1] < 200
 
 
+def stool(hidden_feet, foot=200):
+    """A seat on three legs, and a block before the lower half of its first legs."""
+    seat = polygon((85, 100), (120, 80), (262, 80), (238, 108), (85, 108))
+    full = np.logical_or.reduce([seat, *(polygon((x, 100), (x + 11, 100), (x + 11, foot), (x, foot)) for x in LEGS)])
+    right = LEGS[hidden_feet - 1] + 25
+    return full, polygon((75, 150), (right, 150), (right, 225), (75, 225))
+
+
+LEGS = (88, 148, 215)
+
+
+@pytest.mark.parametrize("hidden_feet", [1, 2])
+@pytest.mark.parametrize("foot", [185, 205])
+def test_hidden_legs_go_on_as_long_as_the_one_that_is_seen_with_their_gaps(hidden_feet, foot):
+    full, front = stool(hidden_feet, foot)
+    completed = complete_outline(full & ~front, front)
+    assert overlap(completed & front, full & front) > 0.8
+    between = polygon((LEGS[0] + 16, 155), (LEGS[1] - 5, 155), (LEGS[1] - 5, foot), (LEGS[0] + 16, foot))
+    assert not (completed & between).any()
+
+
+def test_slats_that_end_at_a_thing_on_the_seat_are_no_legs():
+    back = [polygon((x, 40), (x + 10, 40), (x + 10, 140), (x, 140)) for x in (95, 130, 165, 200)]
+    seat = polygon((90, 130), (215, 130), (215, 180), (90, 180))
+    full, front = np.logical_or.reduce([*back, seat]), disc(152, 118, 32, 1.1)
+    completed = complete_outline(full & ~front, front)
+    assert overlap(completed & front & seat, front & seat) > 0.95
+
+
 @settings(max_examples=20, deadline=None)
 @given(
     st.integers(60, 260), st.integers(50, 190), st.integers(12, 50), st.integers(0, 320), st.integers(0, 240),

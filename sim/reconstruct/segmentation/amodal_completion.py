@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Amodal completion: whole masks of partly hidden objects, and colours for the hidden parts.
 
-The hidden part is guessed by several rules: an ellipse, mirror and point symmetry, continued tangents. A guess is
+The hidden part is guessed by several rules: an ellipse, mirror and point symmetry, continued tangents, legs. A guess is
 scored by how well its rule explains the visible outline, and by whether it needs a coincidence: an object's true
 outline seldom runs along that of the thing in front of it (the generic view: Freeman, Nature 1994).
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...errors import InputError
+from .hidden_legs import with_hidden_legs
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -28,6 +29,8 @@ TILTS = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0)
 """Tilts in degrees of the mirror axis."""
 CONIC_WEIGHT = 2.0
 """Weight of the rational curve that joins two tangents: 1 is a parabola, larger values approach their corner."""
+OPEN = 0.3
+"""Share of background in the visible part of a convex hull, above which the object is not convex there."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,8 @@ def _carried_on(start: tuple[Points, Points], end: tuple[Points, Points], possib
 
 
 def _bridged(outline: Mask, unknown: Mask) -> Mask:
-    """``outline`` with, inside each unseen part, the convex hull of its surroundings."""
+    """``outline`` with, inside each unseen part, the convex hull of its surroundings, unless these have gaps
+    themselves."""
     rest = unknown & ~outline
     count, labels = cv2.connectedComponents(rest.astype(np.uint8))
     side = 2 * round(0.2 * float(np.sqrt(outline.sum()))) + 1
@@ -187,9 +191,19 @@ def _bridged(outline: Mask, unknown: Mask) -> Mask:
     for index in range(1, count):
         part = labels == index
         near = outline & (cv2.dilate(part.astype(np.uint8), kernel) > 0)
-        if part.sum() >= 20 and near.sum() >= 5:
-            result |= _hull(near) & unknown
+        if part.sum() < 20 or near.sum() < 5:
+            continue
+        hull = _hull(near)
+        told = hull & ~unknown
+        if (told & ~outline).sum() <= OPEN * told.sum() or _borne(part, outline):
+            result |= hull & unknown
     return result
+
+
+def _borne(part: Mask, outline: Mask) -> bool:
+    """Whether below most columns of ``part`` lies some of ``outline``: a thing that stands on the object hides it."""
+    below = np.roll(part, 2, axis=0) & outline
+    return bool(below.any(axis=0).sum() > 0.5 * part.any(axis=0).sum())
 
 
 def _share(wrong: Mask, seen: Mask, unknown: Mask) -> float:
@@ -253,7 +267,14 @@ ROOM = 1.0
 """Margin in that copy over the longer side: no hidden part is assumed to reach farther."""
 COINCIDENCE = 0.1
 """Cost of an outline that follows the occluder's border everywhere, in shares of the visible area."""
-PREFERENCE = {"ellipse": -0.03, "mirrored": 0.02, "point_mirrored": 0.03, "seen_again": 0.03, "continued": 0.06}
+PREFERENCE = {
+    "ellipse": -0.03,
+    "legs": 0.0,
+    "mirrored": 0.02,
+    "point_mirrored": 0.03,
+    "seen_again": 0.03,
+    "continued": 0.06,
+}
 """Cost of each rule at equal fit, in shares of the visible area; tuned on drawn solids in front of others."""
 
 
@@ -296,6 +317,9 @@ def complete_outline(mask: Mask, hidden_by: Mask, *, seen_again: Mask | None = N
 
 def _guesses(seen: Mask, unknown: Mask, lowest_base: float) -> list[OutlineGuess]:
     guesses = [continued(seen, unknown, lowest_base)]
+    standing = with_hidden_legs(seen, unknown, lowest_base)
+    if standing is not None:
+        guesses.append(OutlineGuess("legs", standing, 0.0))
     for rule in (ellipse, mirrored, point_mirrored):
         guess = rule(seen, unknown)
         if guess is not None:
