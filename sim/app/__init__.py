@@ -10,7 +10,7 @@ add_effect.py          effects that a diagnosis found, added to a scene
 scene_variant.py       the same scene with other physics
 set_light.py           another light
 compose_scene.py       objects brought to fit each other; compose_inputs.py what that needs
-default_motion.py      a motion for a scene at rest; free_space.py the room for it
+default_motion.py      a motion for a scene at rest; motion_stage.py its moves (moves.py), free_space.py their room
 clip_check.py          warnings about a clip before it is rendered
 bake.py                scene folder → bake folder
 bake_options.py        its options and the hash of its inputs

@@ -7,7 +7,6 @@ it tells what leaves the picture, what falls over, and when the action ends.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Sequence
@@ -32,8 +31,8 @@ Array = NDArray[np.floating]
 STILL_PX = 1.0
 """Way in pixels of the photo below which a thing is taken to stand still over the whole clip."""
 
-STEP_PX = 0.25
-"""Way from frame to frame below which the action is over."""
+STEP = 4e-4
+"""Way from frame to frame, over the picture's longer side, below which all is over: a quarter of a pixel in 640."""
 
 GONE, CUT = 0.1, 0.7
 """Share of what is seen of a thing at most, below which it has left the picture, or is cut by its edge."""
@@ -87,8 +86,10 @@ def seen_tracks(count: int, poses: Iterable[Sequence[Array]], cameras: Iterable[
     return [np.array(found) for found in seen]
 
 
-def leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip) -> str | None:
-    """Return the warning about an object whose points (F, N, 3) are projected; None without one."""
+def leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip, *, end: float = END) -> str | None:
+    """Return the warning about an object whose points (F, N, 3) are projected; None without one, or where it leaves
+    after the share ``end`` of the clip.
+    """
     x, y, depth = np.moveaxis(track, -1, 0)
     beyond = np.stack([-x, x - camera.width, -y, y - camera.height])
     inside = np.mean((beyond.max(axis=0) <= 0) & (depth > 0), axis=1)
@@ -98,7 +99,7 @@ def leaving(name: str, track: NDArray[np.float64], camera: Camera, clip: Clip) -
     # What is thrown into the picture begins outside.
     begin = int(np.argmax(inside >= CUT * most))
     poor = np.nonzero(inside[begin:] < CUT * most)[0]
-    if len(poor) == 0 or (at := begin + int(poor[0])) >= END * count:
+    if len(poor) == 0 or (at := begin + int(poor[0])) >= end * count:
         return None
     edges = ("left", "right", "upper", "lower")
     edge = edges[int(np.argmax(np.mean(beyond[:, at], axis=1)))]
@@ -130,7 +131,7 @@ def _pace(tracks: Sequence[NDArray[np.float64]], cameras: Sequence[Camera], clip
             f"nothing moves in these {count} frames; give an object a velocity (--velocity right,away,up in m/s), or "
             "leave out --still"
         ]
-    moving = np.nonzero(np.maximum.reduce(steps) > STEP_PX)[0]
+    moving = np.nonzero(np.maximum.reduce(steps) > STEP * max(cameras[0].width, cameras[0].height))[0]
     if len(moving) == 0:
         return []
     action, whole = (int(moving[-1]) + 1) / clip.fps, count / clip.fps
@@ -150,8 +151,8 @@ def _flat(tracks: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
 RATE = 60.0
 """Samples a second of the scene."""
 
-LONGER, AT_LEAST_S, AT_MOST_S = 2.0, 0.6, LONGEST_S / 2.0
-"""Length of a rehearsal over the estimated action, and its bounds in seconds of the scene."""
+LONGER_S, AT_MOST_S = 0.5, LONGEST_S
+"""Seconds in the scene by which a rehearsal is longer than the estimated action, and its greatest length."""
 
 TAMED = 0.75
 """Share of the speed that is left to a motion of which something leaves the picture: little over half as far."""
@@ -176,15 +177,14 @@ class Rehearsed:
         """Return the motion with less speed, of which a rehearsal is to be made again."""
         motion = self.motion
         moves = tuple(move.slower(TAMED) for move in motion.moves)
-        # Those after the first begin when the one before has come down.
-        moves = tuple(dataclasses.replace(move, start_s=round(TAMED * move.start_s, 4)) for move in moves)
-        ends = dict.fromkeys(SLOW, TAMED * motion.action_s)
-        return fitted(scene, moves, ends, fps=motion.fps, frames=motion.frames, slow=motion.slow)
+        settles = dict.fromkeys(SLOW, TAMED * (motion.action_s - motion.moves[-1].landed_s))
+        return fitted(scene, moves, settles, fps=motion.fps, frames=motion.frames, slow=motion.slow)
 
 
 def rehearsal_options(motion: DefaultMotion, options: BakeOptions) -> BakeOptions:
     """Return the options of a coarse bake of ``motion`` in place of a bake with ``options``."""
-    seconds = min(max(LONGER * motion.action_s, AT_LEAST_S), AT_MOST_S)
+    # How long something soft or round goes on is the least known.
+    seconds = min(motion.action_s + 2.0 * motion.moves[-1].settle_s + LONGER_S, AT_MOST_S)
     frames = math.ceil(seconds * RATE) + 1
     return BakeOptions(
         frames=frames,
@@ -213,15 +213,19 @@ def rehearsed(
     with np.errstate(invalid="ignore"):
         steps = [np.linalg.norm(np.diff(track[..., :2], axis=0), axis=-1).max(axis=1) for track in tracks]
     speed = np.nan_to_num(np.maximum.reduce(steps)) * rate
-    ends = {}
+    settles = {}
+    step = STEP * max(camera.width, camera.height)
     for each in SLOW:
-        moving = np.flatnonzero(speed > STEP_PX * motion.fps * each)
-        ends[each] = (int(moving[-1]) + 1) / rate if len(moving) else 0.0
-    clip = fitted(scene, motion.moves, ends, fps=motion.fps, frames=frames, slow=slow)
-    shown = min(count, math.ceil(clip.frames / clip.fps / clip.slow * rate) + 1)
+        moving = np.flatnonzero(speed > step * motion.fps * each)
+        end = (int(moving[-1]) + 1) / rate if len(moving) else 0.0
+        settles[each] = max(0.0, end - motion.moves[-1].landed_s)
+    clip = fitted(scene, motion.moves, settles, fps=motion.fps, frames=frames, slow=slow)
+    # The clip may have its moves at other times.
+    seconds = clip.frames / clip.fps / clip.slow - clip.moves[-1].start_s + motion.moves[-1].start_s
+    shown = min(count, math.ceil(seconds * rate) + 1)
     names = [item.name for item in bake.manifest.objects]
     seen = Clip(first=1, fps=rate)
-    gone = [leaving(name, track[:shown], camera, seen) for name, track in zip(names, tracks, strict=True)]
+    gone = [leaving(name, track[:shown], camera, seen, end=1.0) for name, track in zip(names, tracks, strict=True)]
     lying = [
         item.name
         for item, cache in zip(scene.model.objects, caches, strict=True)

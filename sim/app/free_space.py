@@ -64,6 +64,46 @@ class Thing:
         reach = float(np.linalg.norm(ahead[turns <= max(0.3, float(turns.min()))], axis=1).max())
         return math.atan2(reach, max(float((self.centre - self.base.mean(axis=0)) @ up), 1e-9))
 
+    def shifted(self, way: Array) -> Thing:
+        """Return the thing moved along the ground by ``way`` (3,) m."""
+        return dataclasses.replace(
+            self, hull=self.hull + way, points=self.points + way, centre=self.centre + way, base=self.base + way
+        )
+
+    def turned(self, angle: float, up: Array) -> Thing:
+        """Return the thing turned in place by ``angle`` radians about the vertical ``up`` (3,) through its centre."""
+
+        def turn(points: Array) -> Array:
+            local = points - self.centre
+            level = local - np.outer(local @ up, up)
+            return np.asarray(points + (math.cos(angle) - 1.0) * level + math.sin(angle) * np.cross(up, local))
+
+        return dataclasses.replace(self, hull=turn(self.hull), points=turn(self.points), base=turn(self.base))
+
+
+SILHOUETTE = 128
+"""Longest side in pixels at which silhouettes are compared."""
+
+
+def hidden_share(camera: Camera, first: Array, second: Array) -> float:
+    """Return the share, 0 to 1, of the farther one's outline that the nearer one covers, of two hulls (K, 3)."""
+    pixels = [camera.project(hull) for hull in (first, second)]
+    near, far = (_silhouette(camera, seen) for seen in sorted(pixels, key=lambda seen: float(np.median(seen[:, 2]))))
+    return float((near & far).sum()) / max(1, int(far.sum()))
+
+
+def _silhouette(camera: Camera, seen: Array) -> NDArray[np.bool_]:
+    """Return where the convex outline of the projected points ``seen`` (K, 3) is, coarsely."""
+    import cv2
+
+    scale = SILHOUETTE / max(camera.width, camera.height)
+    canvas = np.zeros((math.ceil(scale * camera.height), math.ceil(scale * camera.width)), dtype=np.uint8)
+    if (seen[:, 2] > 0).all():
+        # Far outside OpenCV's numbers overflow.
+        corners = np.clip(scale * seen[:, :2], -4 * SILHOUETTE, 4 * SILHOUETTE).round().astype(np.int32)
+        cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 1)
+    return canvas > 0
+
 
 def outside_frame(camera: Camera, points: Array, margin: float) -> NDArray[np.float64]:
     """Return how far (T,) in pixels the farthest of ``points`` (T, K, 3) lies outside the frame less its margin."""

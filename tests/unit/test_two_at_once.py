@@ -15,8 +15,9 @@ from physgen.batch import cli, stages
 from physgen.sim.app import set_light
 from physgen.sim.app.add_drops import Drop, add_drops
 from physgen.sim.app.compose_scene import composition_folder
-from physgen.sim.app.default_motion import DefaultMotion, Move
+from physgen.sim.app.default_motion import DefaultMotion
 from physgen.sim.app.export_usd import export_usd
+from physgen.sim.app.moves import Move
 from physgen.sim.app.pack_bake import pack_bake
 from physgen.sim.app.reconstruct import Physics, _inputs_hash, set_all_physics, set_physics
 from physgen.sim.app.reconstruct_record import Request, stamp_to_json
@@ -141,7 +142,8 @@ def test_nothing_writes_a_scene_that_another_command_changes(work):
     """The steps of `run` and of Python programs after a reconstruction: physics, motion, drops, a changed model."""
     scene = load_scene(work / "pair")
     jelly = Physics(presets=("jelly",))
-    move = Move(name="a", height=0.1, aside=(0, 0, 0), flight_s=1.0, start_s=0.0, velocity=(0, 0, 1), spin=(0, 0, 0))
+    times = {"flight_s": 1.0, "settle_s": 0.1, "start_s": 0.0}
+    move = Move(name="a", height=0.1, aside=(0, 0, 0), **times, velocity=(0, 0, 1), spin=(0, 0, 0))
     drop = Drop(name="c")
     command = [sys.executable, "-c", HOLDER, "pair"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
