@@ -17,6 +17,10 @@ TERMS = 12
 MOST_SERIES = 0.0675
 """Terms of a ``series``, and its largest p: eigenvalues of Y up to 0.3, where the next term is below 1.2e-8."""
 
+FEW = 6
+FEW_SERIES = 0.0027
+"""The same of what is hardly strained: eigenvalues of Y up to 0.06, where the next term is below 4e-10."""
+
 LOG = (0.0, *((-1.0) ** (n + 1) / n for n in range(1, TERMS + 1)))
 """Taylor coefficients of ln(1 + y)."""
 
@@ -71,9 +75,15 @@ def isotropic(values: vec3, axes: mat3):
 def series(coefficients: ti.template(), p: ti.f32, q: ti.f32):
     """Numbers f of f[0] + f[1] Y + f[2] Y² = sum of coefficients[n] Y^n for a traceless symmetric matrix Y, of which
     p = tr Y² / 2 and q = det Y: by Horner's rule, with Y³ = p Y + q (Cayley and Hamilton)."""
-    f = vec3(coefficients[TERMS], 0.0, 0.0)
-    for i in ti.static(range(TERMS)):
-        f = vec3(q * f[2] + coefficients[TERMS - 1 - i], f[0] + p * f[2], f[1])
+    f = vec3(0.0)
+    if p < FEW_SERIES:
+        f = vec3(coefficients[FEW - 2], coefficients[FEW - 1], coefficients[FEW])
+        for i in ti.static(range(FEW - 2)):
+            f = vec3(q * f[2] + coefficients[FEW - 3 - i], f[0] + p * f[2], f[1])
+    else:
+        f = vec3(coefficients[TERMS - 2], coefficients[TERMS - 1], coefficients[TERMS])
+        for i in ti.static(range(TERMS - 2)):
+            f = vec3(q * f[2] + coefficients[TERMS - 3 - i], f[0] + p * f[2], f[1])
     return f
 
 

@@ -176,8 +176,8 @@ def map_back(law: ti.i32, laws: ti.template(), F: mat3, memory: ti.f32, two_mu: 
     stiffness = 0.0
     b = F @ F.transpose()
     # b = mean (1 + Y): where Y is small, as in all that flows slowly, series in it need no principal axes.
-    mean = ti.max(b.trace() / 3.0, 1e-30)
-    Y = b / mean
+    mean = ti.max(b.trace() * (1.0 / 3.0), 1e-30)
+    Y = b * (1.0 / mean)
     for i in ti.static(range(3)):
         Y[i, i] -= 1.0
     square = Y @ Y
@@ -231,14 +231,14 @@ def return_in_series(
     if elastic != volume or kept != 1.0:
         # exp((elastic - volume) / 3 - (1 - kept) dev e) with dev e = (ln(1 + Y) - skewed / 3) / 2
         power = power_series(0.5 * (kept - 1.0), p, q)
-        scale = ti.exp((elastic - volume) / 3.0 + (1.0 - kept) * skewed / 6.0)
+        scale = ti.exp((elastic - volume) * (1.0 / 3.0) + (1.0 - kept) * skewed * (1.0 / 6.0))
         change = (scale * power[1]) * Y + (scale * power[2]) * square
         for i in ti.static(range(3)):
             change[i, i] += scale * power[0]
         mapped = change @ F
     deviator = (0.5 * kept * log[1]) * Y + (0.5 * kept * log[2]) * square
     for i in ti.static(range(3)):
-        deviator[i, i] -= kept * log[2] * p / 3.0
+        deviator[i, i] -= kept * log[2] * p * (1.0 / 3.0)
     tau, stiffness = hencky_stress(elastic, deviator, kept * shear, two_mu, lam)
     return mapped, remembered, tau, stiffness
 
@@ -259,7 +259,7 @@ def return_along_axes(
     stretch = ti.sqrt(ti.max(squares, LEAST_STRETCH**2))
     strain = ti.log(stretch)
     volume = strain.sum()
-    deviator = strain - volume / 3.0
+    deviator = strain - volume * (1.0 / 3.0)
     shear = deviator.norm()
     elastic, kept, remembered = volume, 1.0, memory
     for model in ti.static(laws.hencky_plastic):
@@ -267,7 +267,7 @@ def return_along_axes(
             elastic, kept, remembered = model.radial_return(volume, shear, memory, own)
     left = stretch
     if elastic != volume or kept != 1.0:
-        left = ti.exp(elastic / 3.0 + kept * deviator)
+        left = ti.exp(elastic * (1.0 / 3.0) + kept * deviator)
     mapped = scaled(F, squares, axes, stretch, left)
     tau, stiffness = hencky_stress(elastic, isotropic(kept * deviator, axes), kept * shear, two_mu, lam)
     return mapped, remembered, tau, stiffness

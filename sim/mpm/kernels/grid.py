@@ -11,7 +11,7 @@ import taichi as ti
 
 from .kernel_arrays import FlowArrays, GridBlocks, NodeArrays, WorldArrays
 from .kernel_bundles import func
-from .lanes import NODE_THREADS
+from .lanes import NODE_THREADS, SERIAL
 from .layout import (
     ACCELERATION,
     ACCELERATION_RATE,
@@ -52,7 +52,7 @@ from .layout import (
     vec4,
 )
 from .time_stepping import FARTHEST_STEP, not_finite
-from .windows import gathered, sum_windows
+from .windows import gathered, sum_windows, turns
 
 SUMS = 16
 """Numbers that a grid block adds to its field's means: mass, mass x place (3), momentum (3), angular momentum (3) and
@@ -166,32 +166,40 @@ def advance_nodes(flowing: ti.template(), worlds: WorldArrays, grid: GridBlocks,
 
     The fourth number of ``nodes.velocity`` is set to 0 for the contact; the mass is in ``nodes.mass``.
     """
-    for gg in range(grid.count * SPREAD):
+    for gg in range(turns(SERIAL, grid.count, nodes.window) * SPREAD):
         if gg % SPREAD == 0:
-            g = gg // SPREAD
-            f = grid.field[g]
-            w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
-            c = w * CONTROL_ROW
-            if worlds.control[c + PHASE] == FULL:
-                dt = ti.cast(worlds.control[c + STEP], ti.f32)
-                push = dt * steady_acceleration(f, w, dt, worlds)
-                wants_means = worlds.field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1
-                drag = worlds.field_numbers[f * FIELD_ROW + DRAG]
-                wind = triple(worlds.field_numbers, f * FIELD_ROW + WIND)
-                sum_windows(g, grid.neighbours, nodes.scattered, nodes.velocity)
-                for i in range(BLOCK_NODES):
-                    q = nodes.velocity[g * BLOCK_NODES + i]
-                    nodes.mass[g * BLOCK_NODES + i] = q[3]
-                    if q[3] > 0.0:
-                        nodes.velocity[g * BLOCK_NODES + i] = drive(q, push, dt, drag, wind)
-                if ti.static(flowing):
-                    sum_windows(g, grid.neighbours, flow.scattered, flow.velocity)
-                    for i in range(BLOCK_NODES):
-                        mass = nodes.mass[g * BLOCK_NODES + i]
-                        if mass > 0.0:
-                            flow.velocity[g * BLOCK_NODES + i] = flow.velocity[g * BLOCK_NODES + i] / mass
-                if wants_means:
-                    add_sums(g, triple(worlds.means, f * MEAN_ROW + MEAN_PLACE), grid, nodes)
+            turn, all_turns = gg // SPREAD, turns(SERIAL, grid.count, nodes.window)
+            for g in range(turn * grid.count // all_turns, (turn + 1) * grid.count // all_turns):
+                advance_grid_block(flowing, g, worlds, grid, nodes, flow)
+
+
+@func
+def advance_grid_block(
+    flowing: ti.template(), g: ti.i32, worlds: WorldArrays, grid: GridBlocks, nodes: NodeArrays, flow: FlowArrays
+):
+    """``advance_nodes`` for grid block ``g``."""
+    f = grid.field[g]
+    w = worlds.field_integers[f * FIELD_INTEGERS + WORLD]
+    c = w * CONTROL_ROW
+    if worlds.control[c + PHASE] == FULL:
+        dt = ti.cast(worlds.control[c + STEP], ti.f32)
+        push = dt * steady_acceleration(f, w, dt, worlds)
+        drag = worlds.field_numbers[f * FIELD_ROW + DRAG]
+        wind = triple(worlds.field_numbers, f * FIELD_ROW + WIND)
+        sum_windows(g, grid.neighbours, nodes.scattered, nodes.velocity)
+        for i in range(BLOCK_NODES):
+            q = nodes.velocity[g * BLOCK_NODES + i]
+            nodes.mass[g * BLOCK_NODES + i] = q[3]
+            if q[3] > 0.0:
+                nodes.velocity[g * BLOCK_NODES + i] = drive(q, push, dt, drag, wind)
+        if ti.static(flowing):
+            sum_windows(g, grid.neighbours, flow.scattered, flow.velocity)
+            for i in range(BLOCK_NODES):
+                mass = nodes.mass[g * BLOCK_NODES + i]
+                if mass > 0.0:
+                    flow.velocity[g * BLOCK_NODES + i] = flow.velocity[g * BLOCK_NODES + i] / mass
+        if worlds.field_integers[f * FIELD_INTEGERS + WANTS_MEANS] == 1:
+            add_sums(g, triple(worlds.means, f * MEAN_ROW + MEAN_PLACE), grid, nodes)
 
 
 @func

@@ -461,22 +461,28 @@ def apply_contact(lanes: ti.template(), worlds: WorldArrays, grid: GridBlocks, n
         for t in range(near.grid_count * BLOCK_NODES):
             apply_to_node(t, worlds, grid, near, nodes)
     else:
-        for ss in range(near.grid_count * SPREAD):
+        for ss in range(turns(lanes, near.grid_count, nodes.window) * SPREAD):
             if ss % SPREAD == 0:
-                s = ss // SPREAD
-                g = near.grid_blocks[s]
-                w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
-                if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
-                    any_touched = 0
-                    for d in range(27):
-                        if grid.neighbours[g * 27 + d] >= 0:
-                            any_touched += near.touched[grid.neighbours[g * 27 + d]]
-                    if any_touched == 0:
-                        continue
-                    sum_chosen_windows(g, s, grid.neighbours, near.touched, nodes.scattered, nodes.sums)
-                    for i in range(BLOCK_NODES):
-                        n = g * BLOCK_NODES + i
-                        if nodes.mass[n] > 0.0:
-                            q = nodes.sums[s * BLOCK_NODES + i] / nodes.mass[n]
-                            u = nodes.velocity[n]
-                            nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])
+                turn, all_turns = ss // SPREAD, turns(lanes, near.grid_count, nodes.window)
+                for s in range(turn * near.grid_count // all_turns, (turn + 1) * near.grid_count // all_turns):
+                    apply_to_block(s, worlds, grid, near, nodes)
+
+
+@func
+def apply_to_block(s: ti.i32, worlds: WorldArrays, grid: GridBlocks, near: NearBlocks, nodes: NodeArrays):
+    """``apply_contact`` at near block ``s``."""
+    g = near.grid_blocks[s]
+    w = worlds.field_integers[grid.field[g] * FIELD_INTEGERS + WORLD]
+    if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
+        any_touched = 0
+        for d in range(27):
+            if grid.neighbours[g * 27 + d] >= 0:
+                any_touched += near.touched[grid.neighbours[g * 27 + d]]
+        if any_touched > 0:
+            sum_chosen_windows(g, s, grid.neighbours, near.touched, nodes.scattered, nodes.sums)
+            for i in range(BLOCK_NODES):
+                n = g * BLOCK_NODES + i
+                if nodes.mass[n] > 0.0:
+                    q = nodes.sums[s * BLOCK_NODES + i] / nodes.mass[n]
+                    u = nodes.velocity[n]
+                    nodes.velocity[n] = vec4(u[0] + q[0], u[1] + q[1], u[2] + q[2], q[3])

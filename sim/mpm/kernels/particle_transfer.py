@@ -135,23 +135,23 @@ def goal_step(
 
 
 @ti.func
+def columns(matrix: mat3):
+    """The columns of ``matrix``, each with a fourth number 0."""
+    return (
+        vec4(matrix[0, 0], matrix[1, 0], matrix[2, 0], 0.0),
+        vec4(matrix[0, 1], matrix[1, 1], matrix[2, 1], 0.0),
+        vec4(matrix[0, 2], matrix[1, 2], matrix[2, 2], 0.0),
+    )
+
+
+@ti.func
 def scatter_past(
-    first: ti.i32,
-    fx: vec3,
-    mass: ti.f32,
-    velocity: vec3,
-    C: mat3,
-    packing: ti.f32,
-    slope: vec3,
-    past_scattered: ti.template(),
+    first: ti.i32, fx: vec3, mass4: vec4, V: vec4, K0: vec4, K1: vec4, K2: vec4, past_scattered: ti.template()
 ):
-    """Momentum without any force, and mass times ln J (``packing``), to the window."""
-    q = mass * (velocity - C @ fx)
-    b4 = vec4(q[0], q[1], q[2], mass * (packing - slope.dot(fx)))
-    c0 = mass * vec4(C[0, 0], C[1, 0], C[2, 0], slope[0])
-    c1 = mass * vec4(C[0, 1], C[1, 1], C[2, 1], slope[1])
-    c2 = mass * vec4(C[0, 2], C[1, 2], C[2, 2], slope[2])
-    spread(first, fx, b4, c0, c1, c2, past_scattered)
+    """Momentum without any force, and mass times ln J, the fourth number of ``V`` and of its slopes ``K0`` to ``K2``,
+    to the window."""
+    b4 = mass4 * (V - fx[0] * K0 - fx[1] * K1 - fx[2] * K2)
+    spread(first, fx, b4, mass4 * K0, mass4 * K1, mass4 * K2, past_scattered)
 
 
 @func
@@ -235,6 +235,8 @@ def advance_block(
         fixed = particles.constants[p]
         vp = vec3(0.0)
         Cp = mat3(0.0)
+        # Velocity and the columns of its gradient once more, four numbers each.
+        V, K0, K1, K2 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
         Fp = particles.F[p]
         slope = vec3(0.0)
         packing = 0.0
@@ -257,11 +259,12 @@ def advance_block(
                     A, B0, B1, B2 = interpolate(first, fx, pads.window)
                 else:
                     A, B0, B1, B2, E01, E02, E12, D0, D1, D2 = interpolate_curved(first, fx, pads.window)
+            V, K0, K1, K2 = A, 4.0 * B0, 4.0 * B1, 4.0 * B2
             for r in ti.static(range(3)):
                 vp[r] = A[r]
-                Cp[r, 0] = 4.0 * B0[r]
-                Cp[r, 1] = 4.0 * B1[r]
-                Cp[r, 2] = 4.0 * B2[r]
+                Cp[r, 0] = K0[r]
+                Cp[r, 1] = K1[r]
+                Cp[r, 2] = K2[r]
             if ti.static(laws.only_elastic):
                 Fp += dt_gather * Cp @ Fp
             else:
@@ -280,6 +283,10 @@ def advance_block(
                     a02 = 0.5 * KEPT * ((kept[0, 2] - 4.0 * past2[0]) - (kept[2, 0] - 4.0 * past0[2]))
                     a12 = 0.5 * KEPT * ((kept[1, 2] - 4.0 * past2[1]) - (kept[2, 1] - 4.0 * past1[2]))
                     Cp += mat3([[0.0, a01, a02], [-a01, 0.0, a12], [-a02, -a12, 0.0]])
+                    V = vec4(vp[0], vp[1], vp[2], 0.0)
+                    K0 += vec4(0.0, -a01, -a02, 0.0)
+                    K1 += vec4(a01, 0.0, -a12, 0.0)
+                    K2 += vec4(a02, a12, 0.0, 0.0)
                     if ti.static(len(laws.volumetric) > 0):
                         if crowds and scatter:
                             strength = dt_gather * STIFFNESS * sound2 * fixed[0]
@@ -288,6 +295,7 @@ def advance_block(
                                 known, first - spot + offset, fx, strength, flow.crowding_window, pads.scattered
                             )
                             vp += given / fixed[0]
+                            V = vec4(vp[0], vp[1], vp[2], 0.0)
                             particles.memory[p] = relaxed(particles.memory[p], crowding)
                     particles.v[p] = vp
                     particles.C[p] = Cp
@@ -320,15 +328,18 @@ def advance_block(
         else:
             vp = particles.v[p]
             Cp = particles.C[p]
+            V = vec4(vp[0], vp[1], vp[2], 0.0)
+            K0, K1, K2 = columns(Cp)
             if ti.static(len(laws.volumetric) > 0):
                 slope = particles.slopes[p]
         if adheres:
             here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
             gap = ti.min(gap, level + normal.dot(here) - fixed[3])
         if scatter:
-            own_v = vp  # before any force
+            own_V = V  # before any force
             if goal > 0.0:
-                vp += goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, worlds, particles)
+                pull = goal_step(f, c, p, dt_scatter, first_node, xi, vp, goal, worlds, particles)
+                V += vec4(pull[0], pull[1], pull[2], 0.0)
             mass = fixed[0]
             tau = mat3(0.0)
             modulus = 0.0
@@ -337,7 +348,12 @@ def advance_block(
             else:
                 tau, modulus = respond(laws, p, Fp, Cp, fixed, worlds, particles)
             stiffness = ti.max(stiffness, modulus / mass)
-            Q = (-4.0 * dt_scatter) * tau + mass * Cp
+            # Zero, which the compiler cannot know: it works on four numbers at once only if it does the same with all.
+            nought = ti.min(mass, 0.0)
+            mass4 = vec4(mass, mass, mass, nought)
+            part = -4.0 * dt_scatter
+            tau0, tau1, tau2 = columns(tau)
+            c0, c1, c2 = part * tau0 + mass4 * K0, part * tau1 + mass4 * K1, part * tau2 + mass4 * K2
             gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
             base = ti.cast(gp - 0.5, ti.i32)
             fx = gp - ti.cast(base, ti.f32)
@@ -345,15 +361,13 @@ def advance_block(
             if touching:
                 # Start the contact solve from the forces of the last substep.
                 a = particles.reaction[p]
-                vp += dt_scatter * vec3(a[0], a[1], a[2])
+                V += dt_scatter * a
                 if ti.static(len(laws.volumetric) > 0):
                     if is_fluid(law):
-                        Q += (4.0 * dt_scatter * mass) * moment_at_surface(vec3(a[0], a[1], a[2]), fixed[3])
-            q = mass * vp - Q @ fx
-            b4 = vec4(q[0], q[1], q[2], mass)
-            c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
-            c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
-            c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
+                        M0, M1, M2 = columns(moment_at_surface(vec3(a[0], a[1], a[2]), fixed[3]))
+                        pressed = 4.0 * dt_scatter * mass
+                        c0, c1, c2 = c0 + pressed * M0, c1 + pressed * M1, c2 + pressed * M2
+            b4 = mass4 * V + vec4(nought, nought, nought, mass) - fx[0] * c0 - fx[1] * c1 - fx[2] * c2
             if ti.static(not laws.flowing):
                 spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
             elif ti.static(laws.only_flowing):
@@ -365,10 +379,11 @@ def advance_block(
                     spread_kept(first, fx, mass, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
             if ti.static(laws.flowing):
                 if flows:
-                    packing = 0.0
-                    if is_fluid(law):
-                        packing = particles.memory[p]
-                    scatter_past(first, fx, mass, own_v, Cp, packing, slope, pads.past_scattered)
+                    if ti.static(len(laws.volumetric) > 0):
+                        if is_fluid(law):
+                            own_V[3], K0[3], K1[3], K2[3] = particles.memory[p], slope[0], slope[1], slope[2]
+                            mass4[3] = mass
+                    scatter_past(first, fx, mass4, own_V, K0, K1, K2, pads.past_scattered)
         p += ti.static(lanes.threads)
     meet(lanes)
     if scatter:

@@ -50,7 +50,7 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_transfer import KEPT, advance_block, goal_step, scatter_past
+from .particle_transfer import KEPT, advance_block, columns, goal_step, scatter_past
 from .windows import (
     LARGEST_WEIGHT,
     LEAST_LARGEST,
@@ -94,9 +94,7 @@ def add_particle(
     times the first of these."""
     q = mass * vp - Q @ fx
     b4 = vec4(q[0], q[1], q[2], mass)
-    c0 = vec4(Q[0, 0], Q[1, 0], Q[2, 0], 0.0)
-    c1 = vec4(Q[0, 1], Q[1, 1], Q[2, 1], 0.0)
-    c2 = vec4(Q[0, 2], Q[1, 2], Q[2, 2], 0.0)
+    c0, c1, c2 = columns(Q)
     b4, c0, c1, c2 = b4 * units, c0 * units, c1 * units, c2 * units
     if ti.static(not laws.flowing):
         spread_kept(first, fx, weight, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
@@ -109,7 +107,9 @@ def add_particle(
             spread_kept(first, fx, weight, b4, c0, c1, c2, E01, E02, E12, D0, D1, D2, pads.scattered)
     if ti.static(laws.flowing):
         if flows:
-            scatter_past(first, fx, mass, own_v, Cp, 0.0, vec3(0.0), pads.past_scattered)
+            V = vec4(own_v[0], own_v[1], own_v[2], 0.0)
+            K0, K1, K2 = columns(Cp)
+            scatter_past(first, fx, vec4(mass), V, K0, K1, K2, pads.past_scattered)
 
 
 @func

@@ -122,10 +122,29 @@ def add_to(window: ti.template(), n: ti.i32, share: vec4):
 @ti.func
 def clear_window(lanes: ti.template(), lane: ti.i32, offset: ti.i32, window: ti.template()):
     """Set a window to zero."""
-    i = lane
-    while i < WINDOW_NODES:
-        set_node(window, offset + in_window(i, window), vec4(0.0))
-        i += ti.static(lanes.threads)
+    if ti.static(is_shared(window)):
+        i = lane
+        while i < WINDOW_NODES:
+            set_node(window, offset + in_window(i, window), vec4(0.0))
+            i += ti.static(lanes.threads)
+    else:
+        nought = vec4(0.0)
+        for four in range(WINDOW_NODES // 4):
+            put_four(window, offset + four * 4, nought, nought, nought, nought)
+
+
+@ti.func
+def put_four(window: Vectors4, first: ti.i32, a: vec4, b: vec4, c: vec4, d: vec4):
+    """Set the four nodes of an array from ``first`` on.
+
+    Taichi reads the array's address anew for each number that it writes, which might have changed it for all that the
+    compiler knows. Where nodes have been read, it keeps their addresses: then it writes them all at once.
+    """
+    old_a, old_b, old_c, old_d = window[first], window[first + 1], window[first + 2], window[first + 3]
+    window[first] = ti.select(first < 0, old_a, a)
+    window[first + 1] = ti.select(first < 0, old_b, b)
+    window[first + 2] = ti.select(first < 0, old_c, c)
+    window[first + 3] = ti.select(first < 0, old_d, d)
 
 
 @ti.func
@@ -220,98 +239,144 @@ def weights(fx: vec3):
 
 
 @ti.func
-def span(side: ti.i32):
-    """Window nodes [low, high) that fall in the block before (0), of (1) or after (2) the window's own block."""
-    low = ti.select(side == 0, 0, ti.select(side == 1, 1, 5))
-    high = ti.select(side == 0, 1, ti.select(side == 1, 5, 8))
-    return low, high
-
-
-@ti.func
 def load_window(k: ti.i32, spot: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
     """Copy the nodes around particle block ``k`` to ``window`` from ``spot`` on."""
-    for d in range(27):
-        g = neighbours[k * 27 + d]
-        il, ih = span(d // 9)
-        jl, jh = span(d // 3 % 3)
-        ml, mh = span(d % 3)
-        for i in range(il, ih):
-            for j in range(jl, jh):
-                for m in range(ml, mh):
-                    node = ((i + 3) & 3) * 16 + ((j + 3) & 3) * 4 + ((m + 3) & 3)
-                    window[spot + i * 64 + j * 8 + m] = nodes[g * BLOCK_NODES + node]
+    for line in range(WINDOW * WINDOW):
+        # As in ``grid_node``.
+        i, j = (line >> 3) + 3, (line & 7) + 3
+        d = k * 27 + (i >> 2) * 9 + (j >> 2) * 3
+        place = (i & 3) * 16 + (j & 3) * 4
+        before = neighbours[d] * BLOCK_NODES + place
+        here = neighbours[d + 1] * BLOCK_NODES + place
+        after = neighbours[d + 2] * BLOCK_NODES + place
+        n = spot + line * WINDOW
+        put_four(window, n, nodes[before + 3], nodes[here], nodes[here + 1], nodes[here + 2])
+        put_four(window, n + 4, nodes[here + 3], nodes[after], nodes[after + 1], nodes[after + 2])
 
 
 @ti.func
-def add_window(k: ti.i32, d: ti.i32, s: ti.i32, window: Vectors4, sums: Vectors4):
-    """Add to slot ``s`` the part of block ``k``'s window that lies in the grid block whose neighbour ``d`` it is."""
-    di, dj, dm = d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1
-    il, ih = ti.select(di == 1, 3, 0), ti.select(di == -1, 3, 4)
-    jl, jh = ti.select(dj == 1, 3, 0), ti.select(dj == -1, 3, 4)
-    ml, mh = ti.select(dm == 1, 3, 0), ti.select(dm == -1, 3, 4)
-    shift = k * WINDOW_NODES + (1 - di * 4) * 64 + (1 - dj * 4) * 8 + (1 - dm * 4)
-    for i in range(il, ih):
-        for j in range(jl, jh):
-            for m in range(ml, mh):
-                n = s * BLOCK_NODES + i * 16 + j * 4 + m
-                sums[n] = sums[n] + window[i * 64 + j * 8 + m + shift]
+def other_side(place: ti.i32):
+    """Of a node at ``place`` 0 to 3 along an axis of its block: which other block's window holds it, 1 or -1."""
+    return ti.select(place == 3, 1, -1)
+
+
+@ti.func
+def has_window(k: ti.i32, chosen: ti.template()):
+    """Whether ``k`` is a particle block, and has a 1 in ``chosen`` (None: any)."""
+    wanted = k >= 0
+    if ti.static(is_given(chosen)):
+        if wanted:
+            wanted = chosen[k] == 1
+    return wanted
+
+
+@ti.func
+def sum_row(g: ti.i32, line: ti.i32, neighbours: Integers, chosen: ti.template(), window: Vectors4):
+    """The four nodes ``line`` of 16 of grid block ``g``: the sums of the windows of the particle blocks around it that
+    have a 1 in ``chosen`` (None: all)."""
+    i, j = line >> 2, line & 3
+    t0, t1, t2, t3 = vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)
+    for corner in range(4):
+        # On each axis two windows hold a node: its own block's, and that of the block before it or, of the last, after.
+        si = ti.select(corner < 2, 0, other_side(i))
+        sj = ti.select(corner & 1 == 0, 0, other_side(j))
+        d = g * 27 + si * 9 + sj * 3 + 12
+        place = (i + 1 - 4 * si) * 64 + (j + 1 - 4 * sj) * 8
+        k = neighbours[d + 1]
+        if has_window(k, chosen):
+            n = k * WINDOW_NODES + place
+            t0 += window[n + 1]
+            t1 += window[n + 2]
+            t2 += window[n + 3]
+            t3 += window[n + 4]
+        k = neighbours[d]
+        if has_window(k, chosen):
+            n = k * WINDOW_NODES + place
+            t0 += window[n + 5]
+            t1 += window[n + 6]
+            t2 += window[n + 7]
+        k = neighbours[d + 2]
+        if has_window(k, chosen):
+            t3 += window[k * WINDOW_NODES + place]
+    return t0, t1, t2, t3
 
 
 @ti.func
 def sum_windows(g: ti.i32, neighbours: Integers, window: Vectors4, nodes: Vectors4):
     """The nodes of grid block ``g``: the sum of the windows of the 27 particle blocks around it."""
-    for i in range(BLOCK_NODES):
-        nodes[g * BLOCK_NODES + i] = vec4(0.0)
-    for d in range(27):
-        k = neighbours[g * 27 + d]
-        if k >= 0:
-            add_window(k, d, g, window, nodes)
+    for line in range(16):
+        t0, t1, t2, t3 = sum_row(g, line, neighbours, None, window)
+        put_four(nodes, g * BLOCK_NODES + line * 4, t0, t1, t2, t3)
 
 
 @ti.func
 def sum_chosen_windows(g: ti.i32, s: ti.i32, neighbours: Integers, chosen: Integers, window: Vectors4, sums: Vectors4):
     """The same into slot ``s`` of ``sums``, of the particle blocks that have a 1 in ``chosen``."""
-    for i in range(BLOCK_NODES):
-        sums[s * BLOCK_NODES + i] = vec4(0.0)
-    for d in range(27):
-        k = neighbours[g * 27 + d]
-        wanted = False
-        if k >= 0:
-            wanted = chosen[k] == 1
-        if wanted:
-            add_window(k, d, s, window, sums)
+    for line in range(16):
+        t0, t1, t2, t3 = sum_row(g, line, neighbours, chosen, window)
+        put_four(sums, s * BLOCK_NODES + line * 4, t0, t1, t2, t3)
+
+
+@ti.func
+def along_line(first: ti.i32, w: ti.template(), window: ti.template()):
+    """Of three nodes from ``first`` on: their mean under the weights of the last axis, and first moment."""
+    u1 = w[1][2] * node_of(window, first + 1)
+    u2 = w[2][2] * node_of(window, first + 2)
+    slope = u1 + u2
+    return w[0][2] * node_of(window, first) + slope, slope + u2
+
+
+@ti.func
+def across_layer(first: ti.i32, w: ti.template(), window: ti.template()):
+    """Of nine nodes from ``first`` on: mean, and first moments along the last two axes."""
+    S0, T0 = along_line(first, w, window)
+    S1, T1 = along_line(first + 8, w, window)
+    S2, T2 = along_line(first + 16, w, window)
+    t1, t2 = w[1][1] * S1, w[2][1] * S2
+    B1 = t1 + t2
+    return w[0][1] * S0 + B1, B1 + t2, w[0][1] * T0 + w[1][1] * T1 + w[2][1] * T2
 
 
 @ti.func
 def interpolate(first: ti.i32, fx: vec3, window: ti.template()):
-    """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis."""
+    """Mean of the window's numbers at ``fx`` from its node ``first``, and a quarter of their slope along each axis.
+
+    The compiler adds what is written, zeros too: no sum begins with one.
+    """
     w = weights(fx)
-    A = vec4(0.0)
-    B0 = vec4(0.0)
-    B1 = vec4(0.0)
-    B2 = vec4(0.0)
-    for i in ti.static(range(3)):
-        Ai = vec4(0.0)
-        B1i = vec4(0.0)
-        B2i = vec4(0.0)
-        for j in ti.static(range(3)):
-            Aj = vec4(0.0)
-            B2j = vec4(0.0)
-            for m in ti.static(range(3)):
-                u = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + m)) * w[m][2]
-                Aj += u
-                if ti.static(m > 0):
-                    B2j += float(m) * u
-            Ai += w[j][1] * Aj
-            B2i += w[j][1] * B2j
-            if ti.static(j > 0):
-                B1i += (float(j) * w[j][1]) * Aj
-        A += w[i][0] * Ai
-        B1 += w[i][0] * B1i
-        B2 += w[i][0] * B2i
-        if ti.static(i > 0):
-            B0 += (float(i) * w[i][0]) * Ai
-    return A, B0 - fx[0] * A, B1 - fx[1] * A, B2 - fx[2] * A
+    step = ti.static(layer(window))
+    A0, L0, M0 = across_layer(first, w, window)
+    A1, L1, M1 = across_layer(first + step, w, window)
+    A2, L2, M2 = across_layer(first + 2 * step, w, window)
+    a1, a2 = w[1][0] * A1, w[2][0] * A2
+    B0 = a1 + a2
+    A = w[0][0] * A0 + B0
+    B1 = w[0][0] * L0 + w[1][0] * L1 + w[2][0] * L2
+    B2 = w[0][0] * M0 + w[1][0] * M1 + w[2][0] * M2
+    return A, B0 + a2 - fx[0] * A, B1 - fx[1] * A, B2 - fx[2] * A
+
+
+@ti.func
+def along_curved_line(first: ti.i32, w: ti.template(), window: ti.template()):
+    """As ``along_line``, and the second difference."""
+    u0, u1, u2 = node_of(window, first), node_of(window, first + 1), node_of(window, first + 2)
+    v1, v2 = w[1][2] * u1, w[2][2] * u2
+    slope = v1 + v2
+    return w[0][2] * u0 + slope, slope + v2, u0 + u2 - (u1 + u1)
+
+
+@ti.func
+def across_curved_layer(first: ti.i32, w: ti.template(), window: ti.template()):
+    """As ``across_layer``, and the mixed second moment and the second differences along the last two axes."""
+    S0, T0, C0 = along_curved_line(first, w, window)
+    S1, T1, C1 = along_curved_line(first + 8, w, window)
+    S2, T2, C2 = along_curved_line(first + 16, w, window)
+    s1, s2 = w[1][1] * S1, w[2][1] * S2
+    t1, t2 = w[1][1] * T1, w[2][1] * T2
+    B1, M12 = s1 + s2, t1 + t2
+    A, B2 = w[0][1] * S0 + B1, w[0][1] * T0 + M12
+    D2 = w[0][1] * C0 + w[1][1] * C1 + w[2][1] * C2
+    return A, B1 + s2, B2, M12 + t2, S0 + S2 - (S1 + S1), D2
 
 
 @ti.func
@@ -319,55 +384,36 @@ def interpolate_curved(first: ti.i32, fx: vec3, window: ti.template()):
     """As ``interpolate``, and second derivatives per cell²: a sixteenth of those along two axes (01, 02, 12), and
     those along one (0, 1, 2)."""
     w = weights(fx)
-    A = vec4(0.0)
-    B0 = vec4(0.0)
-    B1 = vec4(0.0)
-    B2 = vec4(0.0)
-    M01 = vec4(0.0)
-    M02 = vec4(0.0)
-    M12 = vec4(0.0)
-    D0 = vec4(0.0)
-    D1 = vec4(0.0)
-    D2 = vec4(0.0)
-    for i in ti.static(range(3)):
-        Ai = vec4(0.0)
-        B1i = vec4(0.0)
-        B2i = vec4(0.0)
-        M12i = vec4(0.0)
-        D1i = vec4(0.0)
-        D2i = vec4(0.0)
-        for j in ti.static(range(3)):
-            u0 = node_of(window, first + (i * ti.static(layer(window)) + j * 8))
-            u1 = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + 1))
-            u2 = node_of(window, first + (i * ti.static(layer(window)) + j * 8 + 2))
-            v1 = w[1][2] * u1
-            v2 = w[2][2] * u2
-            Aj = w[0][2] * u0 + v1 + v2
-            B2j = v1 + 2.0 * v2
-            Ai += w[j][1] * Aj
-            B2i += w[j][1] * B2j
-            D2i += w[j][1] * (u0 - 2.0 * u1 + u2)
-            if ti.static(j > 0):
-                B1i += (float(j) * w[j][1]) * Aj
-                M12i += (float(j) * w[j][1]) * B2j
-            if ti.static(j == 1):
-                D1i -= 2.0 * Aj
-            else:
-                D1i += Aj
-        A += w[i][0] * Ai
-        B1 += w[i][0] * B1i
-        B2 += w[i][0] * B2i
-        M12 += w[i][0] * M12i
-        D1 += w[i][0] * D1i
-        D2 += w[i][0] * D2i
-        if ti.static(i > 0):
-            B0 += (float(i) * w[i][0]) * Ai
-            M01 += (float(i) * w[i][0]) * B1i
-            M02 += (float(i) * w[i][0]) * B2i
-        if ti.static(i == 1):
-            D0 -= 2.0 * Ai
-        else:
-            D0 += Ai
+    step = ti.static(layer(window))
+    A, B1, B2, M12, D1, D2 = across_curved_layer(first, w, window)
+    D0 = A
+    A *= w[0][0]
+    B1 *= w[0][0]
+    B2 *= w[0][0]
+    M12 *= w[0][0]
+    D1 *= w[0][0]
+    D2 *= w[0][0]
+    A1, L1, M1, N1, E1, F1 = across_curved_layer(first + step, w, window)
+    D0 -= A1 + A1
+    B0, M01, M02 = w[1][0] * A1, w[1][0] * L1, w[1][0] * M1
+    A += B0
+    B1 += M01
+    B2 += M02
+    M12 += w[1][0] * N1
+    D1 += w[1][0] * E1
+    D2 += w[1][0] * F1
+    A2, L2, M2, N2, E2, F2 = across_curved_layer(first + 2 * step, w, window)
+    D0 += A2
+    a2, l2, m2 = w[2][0] * A2, w[2][0] * L2, w[2][0] * M2
+    A += a2
+    B1 += l2
+    B2 += m2
+    M12 += w[2][0] * N2
+    D1 += w[2][0] * E2
+    D2 += w[2][0] * F2
+    B0 += a2 + a2
+    M01 += l2 + l2
+    M02 += m2 + m2
     C0 = B0 - fx[0] * A
     C1 = B1 - fx[1] * A
     C2 = B2 - fx[2] * A
@@ -399,32 +445,38 @@ def spread_curved(
     w = weights(fx)
     # Where whole numbers are added, a node gets what rounding has left at the one before: the sum is the particle's.
     left = vec4(0.0)
+    b, s1, s2, mode = b4, c1, c2, d0
     for i in ti.static(range(3)):
-        bi = b4 + float(i) * c0
-        c1i = c1 + float(i) * e01
-        c2i = c2 + float(i) * e02
+        if ti.static(i > 0):
+            b += c0
+            s1 += e01
+            s2 += e02
+            mode = d0
+        if ti.static(i == 1):
+            mode = -2.0 * d0
+        bi, ci = w[i][0] * b + mode, w[i][0] * s2
+        step, turn = w[i][0] * s1, w[i][0] * e12
+        x1, x2 = w[i][0] * d1, w[i][0] * d2
         for j in ti.static(range(3)):
-            wij = w[i][0] * w[j][1]
-            bj = wij * (bi + float(j) * c1i)
-            if ti.static(i == 1):
-                bj -= (2.0 * w[j][1]) * d0
-            else:
-                bj += w[j][1] * d0
+            if ti.static(j > 0):
+                bi += step
+                ci += turn
+            bj, cj, dj = w[j][1] * bi, w[j][1] * ci, w[j][1] * x2
             if ti.static(j == 1):
-                bj -= (2.0 * w[i][0]) * d1
+                bj -= x1 + x1
             else:
-                bj += w[i][0] * d1
-            cj = wij * (c2i + float(j) * e12)
-            dj = wij * d2
+                bj += x1
             n = first + (i * ti.static(layer(window)) + j * 8)
+            near, far = bj + cj, bj + cj + cj
+            q0, q1, q2 = w[0][2] * bj + dj, w[1][2] * near - (dj + dj), w[2][2] * far + dj
             if ti.static(is_whole(window)):
-                left = add_whole(window, n, left + w[0][2] * bj + dj)
-                left = add_whole(window, n + 1, left + w[1][2] * (bj + cj) - 2.0 * dj)
-                left = add_whole(window, n + 2, left + w[2][2] * (bj + 2.0 * cj) + dj)
+                left = add_whole(window, n, left + q0)
+                left = add_whole(window, n + 1, left + q1)
+                left = add_whole(window, n + 2, left + q2)
             else:
-                add_to(window, n, w[0][2] * bj + dj)
-                add_to(window, n + 1, w[1][2] * (bj + cj) - 2.0 * dj)
-                add_to(window, n + 2, w[2][2] * (bj + 2.0 * cj) + dj)
+                add_to(window, n, q0)
+                add_to(window, n + 1, q1)
+                add_to(window, n + 2, q2)
 
 
 @ti.func
@@ -446,7 +498,8 @@ def spread_kept(
 ):
     """As ``spread``, with what a particle of ``mass`` keeps of the second derivatives that ``interpolate_curved``
     gave."""
-    keep = CURVED * vec4(mass, mass, mass, 0.0)
+    # The last is 0, but the compiler shall do with it what it does with the others.
+    keep = CURVED * vec4(mass, mass, mass, ti.min(mass, 0.0))
     e01 = 16.0 * keep * E01
     e02 = 16.0 * keep * E02
     e12 = 16.0 * keep * E12
@@ -467,18 +520,23 @@ def spread(first: ti.i32, fx: vec3, b4: vec4, c0: vec4, c1: vec4, c2: vec4, wind
     """Add b4 + i c0 + j c1 + m c2 to the window's node (i, j, m) from ``first``, times its weight at ``fx``."""
     w = weights(fx)
     left = vec4(0.0)
+    b = b4
     for i in ti.static(range(3)):
-        bi = b4 + float(i) * c0
+        if ti.static(i > 0):
+            b += c0
+        bi, step, ci = w[i][0] * b, w[i][0] * c1, w[i][0] * c2
         for j in ti.static(range(3)):
-            wij = w[i][0] * w[j][1]
-            bj = wij * (bi + float(j) * c1)
-            cj = wij * c2
+            if ti.static(j > 0):
+                bi += step
+            bj, cj = w[j][1] * bi, w[j][1] * ci
             for m in ti.static(range(3)):
+                if ti.static(m > 0):
+                    bj += cj
                 n = first + (i * ti.static(layer(window)) + j * 8 + m)
                 if ti.static(is_whole(window)):
-                    left = add_whole(window, n, left + w[m][2] * (bj + float(m) * cj))
+                    left = add_whole(window, n, left + w[m][2] * bj)
                 else:
-                    add_to(window, n, w[m][2] * (bj + float(m) * cj))
+                    add_to(window, n, w[m][2] * bj)
 
 
 @ti.func
