@@ -23,7 +23,7 @@ from .kernels.kernel_arrays import (
     WorldArrays,
 )
 from .kernels.lanes import Lanes
-from .kernels.layout import BLOCK, BLOCK_NODES, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, vec4
+from .kernels.layout import BLOCK, BLOCK_NODES, PAIRS, SCALARS_PER_BLOCK, WINDOW_NODES, ivec3, vec4
 from .kernels.runtime import new_array
 from .rigid.rigid_bodies import RigidBodies
 
@@ -40,13 +40,24 @@ class BlockLists:
     """
 
     def __init__(
-        self, *, field_count: int, rigid_bodies: int, flowing: bool, fluid: bool, lanes: Lanes, windows: int
+        self,
+        *,
+        field_count: int,
+        several: bool,
+        rigid_bodies: int,
+        flowing: bool,
+        fluid: bool,
+        lanes: Lanes,
+        windows: int,
     ) -> None:
-        """rigid_bodies: the most that one world has. flowing, fluid: whether any law needs past values of the nodes,
+        """several: whether a world has several fields.
+
+        rigid_bodies: the most that one world has. flowing, fluid: whether any law needs past values of the nodes,
         or the crowding of particles. lanes: threads that share a block. windows: at most, to read nodes from, where
         those do not lie in shared memory."""
         self._field_count, self._rigid_bodies, self._lanes = field_count, rigid_bodies, lanes
         self._flowing, self._fluid, self._windows = flowing, fluid, windows
+        self._several = several
         self._g_starts = new_array(ti.i32, field_count + 1)
         self._p_count = self._g_count = 0
         self._near = (0, 0)
@@ -65,6 +76,8 @@ class BlockLists:
             self._p_neighbours = new_array(ti.i32, p * 27)
             self._near_of_p, self._near_p = new_array(ti.i32, p), new_array(ti.i32, p)
             self._meets_p, self._meet_p = new_array(ti.i32, p), new_array(ti.i32, p)
+            self._pair_counts = new_array(ti.i32, p)
+            self._pairs = new_array(ti.i32, 3 * PAIRS * p if self._several else 1)
             self._touched, self._slack = new_array(ti.i32, p), new_array(ti.f32, p)
             self.pushes = new_array(ti.f32, max(1, p * self._rigid_bodies * PUSH))
             read = 1 if self._lanes.shared else min(p, self._windows) * WINDOW_NODES
@@ -89,6 +102,10 @@ class BlockLists:
             crowded = max(1, g * self._rigid_bodies * PUSH) if self._fluid else 1
             self._crowd_pushes = new_array(ti.f32, crowded)
             self._masses = new_array(ti.f32, g * BLOCK_NODES)
+            met = g if self._several else 1
+            self._met_around, self._lead_fields = new_array(ti.i32, met * 27), new_array(ti.i32, met)
+            self._faces = new_array(vec4, met * BLOCK_NODES)
+            self._others = new_array(ti.f32, met * BLOCK_NODES)
             self._block_sums = new_array(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
             self._g_keys, self._g_slots = new_array(ti.i64, self._g_mask + 1), new_array(ti.i32, self._g_mask + 1)
@@ -128,17 +145,17 @@ class BlockLists:
             if self._g_count <= self._g_capacity:
                 break
             self._allocate(0, int(GROWTH * self._g_count) + LEAST_BLOCKS)
-        sorting.link_blocks.launch(self.particle_blocks, self.grid_blocks, self._p_table, self._g_table)
+        sorting.link_blocks.launch(self.particle_blocks, self.grid_blocks, self.particle_table, self._g_table)
         if self._fluid:
             sorting.link_grid_blocks.launch(self.grid_blocks, self._g_table, self._around)
         if self._lanes.parallel:
             blocks = self.particle_blocks
-            parallel_sorting.place_in_turn.launch(count, x, keys, self._cursors, targets, self._p_table, blocks)
+            parallel_sorting.place_in_turn.launch(count, x, keys, self._cursors, targets, self.particle_table, blocks)
         else:
-            sorting.place.launch(count, keys, self._cursors, targets, self._p_table)
+            sorting.place.launch(count, keys, self._cursors, targets, self.particle_table)
 
     def _list_particle_blocks(self, count: int, keys: ti.Ndarray) -> int:
-        table, blocks = self._p_table, self.particle_blocks
+        table, blocks = self.particle_table, self.particle_blocks
         if self._lanes.parallel:
             return int(
                 parallel_sorting.list_particle_blocks_in_parallel(
@@ -203,7 +220,8 @@ class BlockLists:
         return GridBlocks(self._g_count, self._g_cells, self._g_field, self._g_starts, self._g_neighbours)
 
     @property
-    def _p_table(self) -> BlockTable:
+    def particle_table(self) -> BlockTable:
+        """Particle blocks by their keys, for kernels."""
         return BlockTable(self._p_mask, self._p_keys, self._p_slots)
 
     @property
@@ -220,7 +238,19 @@ class BlockLists:
     def overlap_blocks(self) -> OverlapBlocks:
         """Blocks in which several fields have nodes, as last listed."""
         return OverlapBlocks(
-            *self._overlap, self._mate, self._meet, self._meet_g, self._leads, self._meet_p, self._meets_p
+            *self._overlap,
+            self._mate,
+            self._meet,
+            self._meet_g,
+            self._leads,
+            self._meet_p,
+            self._meets_p,
+            self._met_around,
+            self._lead_fields,
+            self._faces,
+            self._others,
+            self._pair_counts,
+            self._pairs,
         )
 
     @property

@@ -155,6 +155,7 @@ class Engine:
         self._targets = new_array(ti.i32, self._capacity)
         self._blocks = BlockLists(
             field_count=self.field_count,
+            several=self._several,
             rigid_bodies=self._most_rigid_bodies,
             flowing=models.flowing,
             fluid=bool(models.volumetric),
@@ -522,6 +523,7 @@ class Engine:
             "grid": self._blocks.grid_blocks,
             "near": self._blocks.near_blocks,
             "overlap": self._blocks.overlap_blocks,
+            "table": self._blocks.particle_table,
             "particles": self._particle_bundle(),
             "nodes": self._blocks.nodes,
             "flow": self._blocks.flow,

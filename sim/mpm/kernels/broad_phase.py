@@ -34,7 +34,7 @@ from .layout import (
     WORLD_ROW,
     triple,
 )
-from .sorting import block_key, slot_of
+from .sorting import block_key, neighbour_offset, slot_of
 
 HALF_SIDE = 3.0
 """Half the side in cells of the cube that a block's particles stay in before the next sort (window 0.5 to 6.5)."""
@@ -151,6 +151,23 @@ def find_mates(worlds: WorldArrays, grid: GridBlocks, table: BlockTable, overlap
 
 
 @func
+def link_overlap(s: ti.i32, grid: GridBlocks, table: BlockTable, overlap: OverlapBlocks):
+    """Find the blocks of the same field around the listed block ``s``."""
+    g = overlap.grid_blocks[s]
+    for d in range(27):
+        overlap.around[s * 27 + d] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(d)), table)
+
+
+@func
+def name_leads(n: ti.i32, grid: GridBlocks, overlap: OverlapBlocks):
+    """Note the first field for all listed blocks in the place of lead ``n``."""
+    b = overlap.leads[n]
+    while b >= 0:
+        overlap.lead_fields[overlap.slot[b]] = grid.field[overlap.leads[n]]
+        b = overlap.mate[b]
+
+
+@func
 def overlaps_around(k: ti.i32, blocks: ParticleBlocks, overlap: OverlapBlocks):
     """Whether a grid block around particle block ``k`` is listed in ``overlap``."""
     found = False
@@ -175,6 +192,10 @@ def list_overlap_blocks_in_parallel(
             slot = ti.atomic_add(grid_count, 1)
             overlap.slot[g] = slot
             overlap.grid_blocks[slot] = g
+    for s in range(grid_count):
+        link_overlap(s, grid, table, overlap)
+    for n in range(lead_count):
+        name_leads(n, grid, overlap)
     for k in range(blocks.count):
         overlap.chosen[k] = 0
         if overlaps_around(k, blocks, overlap):
@@ -202,6 +223,10 @@ def list_overlap_blocks(
             overlap.slot[g] = found[0]
             overlap.grid_blocks[found[0]] = g
             found[0] += 1
+    for s in range(found[0]):
+        link_overlap(s, grid, table, overlap)
+    for n in range(found[1]):
+        name_leads(n, grid, overlap)
     ti.loop_config(serialize=True)
     for k in range(blocks.count):
         overlap.chosen[k] = 0

@@ -33,6 +33,7 @@ its other side: its distance is -(s + t/2), its normal the other way round.
 import taichi as ti
 
 from .adhesion import counted, largest_pull, least_speed
+from .body_faces import facing, facing_thin, find_faces, meet_as_thin, surer
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
 from .kernel_arrays import (
     AdhesionArrays,
@@ -58,7 +59,6 @@ from .layout import (
     FIRST_PAIR,
     FIXED_ONE,
     FULL,
-    FULL_MASS,
     MODE,
     PHASE,
     RECOVERY_SPEED,
@@ -69,7 +69,6 @@ from .layout import (
     SPREAD,
     STEP,
     STICKING,
-    THICKNESS,
     TOUCH_ROW,
     WINDOW_NODES,
     WORLD,
@@ -79,17 +78,10 @@ from .layout import (
     vec4,
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
-from .surface_shares import LEAST_SLOPE, distance_from_middle, distance_of_share, slope_along
 from .windows import add_to, clear_window, first_of, gathered, layer, store_window, sum_chosen_windows, weights
 
 SWEEPS = 8
 """Passes over the pairs of bodies at a node where three or more meet and some are thin."""
-
-MOST_SHARE = 0.6
-"""Share of a thick body at a node that may lie behind a thin one which touches it; 0.5 where nothing overlaps."""
-
-LEAST_SHARE = 0.0026
-"""Share below which a body is too far from the node (1.25 cells) for a distance."""
 
 
 @func
@@ -182,6 +174,7 @@ def separate(
 ):
     """Apply impulses between every two fields at every node that both reach, to ``nodes.velocity``; ``thin``: some
     fields are thin bodies; ``adheres``: some adhere to others."""
+    find_faces(worlds, grid, overlap, nodes)
     if ti.static(adheres):
         for n in range(adhesion.pair_count):
             adhesion.pair_sums[n] = 0
@@ -280,10 +273,16 @@ def separate_pairs(
                     nodes.sums[overlap.slot[b] * BLOCK_NODES + i],
                 )
                 found, normal, gap = False, vec3(0.0), 0.0
+                as_thin = False
                 if ti.static(thin):
-                    found, normal, gap = facing_thin(
-                        grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW, sa, sb, worlds
-                    )
+                    as_thin = meet_as_thin(grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW, worlds)
+                if as_thin:
+                    if ti.static(thin):
+                        found, normal, gap = facing_thin(
+                            grid.field[a] * FIELD_ROW, grid.field[b] * FIELD_ROW, sa, sb, worlds
+                        )
+                elif a == lead:
+                    found, normal, gap = surer(b, i, sa, sb, overlap)
                 else:
                     found, normal, gap = facing(sa, sb)
                 if found:
@@ -300,62 +299,6 @@ def separate_pairs(
                         push_apart(adheres, na, nb, normal, gap, pair * TOUCH_ROW, pull, dt, recovery, worlds, nodes)
             b = overlap.mate[b]
         a = overlap.mate[a]
-
-
-@func
-def facing(sa: vec4, sb: vec4):
-    """Whether two fields meet at a node, by the slopes and shares ``sa`` and ``sb`` of both there; the normal from the
-    first to the second, and the gap in cells."""
-    found, gap = False, 0.0
-    normal = vec3(sb[0] - sa[0], sb[1] - sa[1], sb[2] - sa[2])
-    length = normal.norm()
-    if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE and length > 1e-6:
-        normal /= length
-        gap = distance_of_share(sa[3]) + distance_of_share(sb[3])
-        found = True
-    return found, normal, gap
-
-
-@func
-def field_thickness(row: ti.i32, worlds: WorldArrays):
-    """Cells across the body whose field's numbers start at ``row``; 0 where it is not thin."""
-    t = 0.0
-    if worlds.field_numbers[row + FULL_MASS] == 0.0:
-        t = worlds.field_numbers[row + THICKNESS]
-    return t
-
-
-@func
-def facing_thin(fa: ti.i32, fb: ti.i32, sa: vec4, sb: vec4, worlds: WorldArrays):
-    """As ``facing`` where bodies may be thin; ``fa`` and ``fb``: where the rows of both fields start."""
-    found, direction, gap = False, vec3(0.0), 0.0
-    if sa[3] > LEAST_SHARE and sb[3] > LEAST_SHARE:
-        slope_a, slope_b = vec3(sa[0], sa[1], sa[2]), vec3(sb[0], sb[1], sb[2])
-        ta, tb = field_thickness(fa, worlds), field_thickness(fb, worlds)
-        da, db, middle_a, middle_b = 0.0, 0.0, 1e9, 1e9
-        if ta > 0.0:
-            middle_a = distance_from_middle(sa[3], slope_along(slope_a, slope_b, ti.cast(tb == 0.0, ti.i32)), ta)
-            da = middle_a - 0.5 * ta
-        else:
-            da = distance_of_share(sa[3])
-        if tb > 0.0:
-            middle_b = distance_from_middle(sb[3], slope_along(slope_b, slope_a, ti.cast(ta == 0.0, ti.i32)), tb)
-            db = middle_b - 0.5 * tb
-        else:
-            db = distance_of_share(sb[3])
-        alike = slope_a.dot(slope_b) > 0.0 and ti.min(slope_a.norm(), slope_b.norm()) > LEAST_SLOPE
-        # Well inside a thick body its share may fall towards its other face.
-        if alike and middle_a < middle_b and (tb > 0.0 or sb[3] < MOST_SHARE):
-            da = -middle_a - 0.5 * ta
-            slope_a = -slope_a
-        elif alike and middle_b < 1e8 and (ta > 0.0 or sa[3] < MOST_SHARE):
-            db = -middle_b - 0.5 * tb
-            slope_b = -slope_b
-        normal = slope_b - slope_a
-        length = normal.norm()
-        if length > 1e-6:
-            found, direction, gap = True, normal / length, da + db
-    return found, direction, gap
 
 
 @func

@@ -161,6 +161,25 @@ class OverlapBlocks(NamedTuple):
     chosen: Integers
     """(P,) 1 where a particle block is listed in ``particle_blocks``."""
 
+    around: Integers
+    """(grid_count, 27) grid blocks of the same field around those in ``grid_blocks``, -1 for none."""
+
+    lead_fields: Integers
+    """(grid_count,) first field in the place of those in ``grid_blocks``."""
+
+    faces: Vectors4
+    """(grid_count, BLOCK_NODES) where that field meets the block's: the normal from it, and the gap (cells), both times
+    how well the node tells them, see ``body_faces``."""
+
+    others: Scalars
+    """(grid_count, BLOCK_NODES) share of all other fields at the nodes of ``grid_blocks``."""
+
+    pair_counts: Integers
+    """(P,) pairs of particles that a block has found, see ``particle_pairs``."""
+
+    pairs: Integers
+    """(P, PAIRS, 3) a particle of the block, the block of its partner, and the partner."""
+
 
 class ParticleState(NamedTuple):
     """State of every particle that substeps change, sorted by block."""

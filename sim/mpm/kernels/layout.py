@@ -36,6 +36,9 @@ FIXED_HIGH = 13 * (FIXED_ONE // 2) - 1
 SPREAD = 128
 """Loop iterations spent on one block: Taichi's CPU backend gives a thread at least 512 iterations at a time."""
 
+PAIRS = 64
+"""Pairs of particles of two bodies that a block of particles lists at most, see ``particle_pairs``."""
+
 SCALARS_PER_BLOCK = 8
 """Numbers that a block reports each substep, see ``ParticleBlocks.report``."""
 

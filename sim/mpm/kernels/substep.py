@@ -7,6 +7,7 @@
     advance_grid      nodes over STEP: velocities, forces
     part_bodies       contact between deformable bodies that are near each other
     crowd_fluids      crowding of fluids at the nodes
+    part_particles    contact between particles of deformable bodies that are in each other
     resolve_contact   contact with plane, rigid bodies, colliders and pins; impulses on rigid bodies
     (rigid)           motion of rigid bodies: ``rigid_motion.rigid_substep``
     advance_matter    grid to particles over STEP, particles to grid with the stress of NEXT_STEP, the next plan
@@ -28,6 +29,7 @@ from .deformable_contact import gather_shares, scatter_shares, separate
 from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
     AdhesionArrays,
+    BlockTable,
     CouplingArrays,
     FlowArrays,
     GridBlocks,
@@ -45,6 +47,7 @@ from .kernel_bundles import BundledKernel, Launcher, kernel, merged
 from .lanes import Lanes
 from .layout import CONTROL_ROW, FULL, PHASE, STEP, Integers
 from .particle_contact import apply_contact, solve_contact
+from .particle_pairs import list_pairs, part_pairs, sum_others
 from .time_stepping import forget_reports, review, review_in_parallel, settle
 from .whole_transfer import advance_particles
 
@@ -116,6 +119,28 @@ def crowd_fluids_of(meeting: bool) -> BundledKernel:
             push_fields(worlds, grid, overlap, nodes, flow)
 
     return crowd_fluids
+
+
+@functools.cache
+def part_particles_of(lanes: Lanes, thin: bool) -> BundledKernel:
+    """Kernel of contact between particles of deformable bodies; ``thin``: some bodies are thin all over."""
+
+    @kernel
+    def part_particles(
+        worlds: WorldArrays,
+        blocks: ParticleBlocks,
+        grid: GridBlocks,
+        overlap: OverlapBlocks,
+        particles: ParticleArrays,
+        nodes: NodeArrays,
+        table: BlockTable,
+    ):
+        """Impulses between particles of different bodies that are too near, from the shares that are in ``sums``."""
+        sum_others(worlds, grid, overlap, nodes)
+        list_pairs(thin, lanes, worlds, blocks, overlap, particles, nodes, table)
+        part_pairs(lanes, worlds, blocks, overlap, particles, nodes)
+
+    return part_particles
 
 
 @kernel
@@ -229,6 +254,8 @@ def substep_launcher(
     fluid = bool(law_set(laws).volumetric)
     if fluid:
         kernels.append(crowd_fluids_of(overlap))
+    if overlap:
+        kernels.append(part_particles_of(lanes, thin))
     if bodies:
         kernels.append(plan_bodies)
     if near:
