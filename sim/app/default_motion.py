@@ -209,7 +209,9 @@ def _next_move(stage: Stage, chosen: Sequence[Move], still: Collection[str]) -> 
         return max(standing, key=lambda pair: pair[0])[1]
     if MOST_MOVES - len(chosen) > len(rolling) and not any(stage.thing(name).round for name in moved):
         for name in moved:
-            if (found := stage.best(stage.thing(name))) is not None:
+            found = stage.best(stage.thing(name))
+            # The same hop on the spot twice in a row looks like one that never comes down.
+            if found is not None and not (found[1].on_the_spot and chosen[-1].on_the_spot and chosen[-1].name == name):
                 return found[1]
     return max(rolling, key=lambda pair: pair[0])[1] if rolling else None
 

@@ -42,6 +42,11 @@ class Move:
         """Whether it is a push."""
         return self.height == 0.0
 
+    @property
+    def on_the_spot(self) -> bool:
+        """Whether it is a hop straight up."""
+        return not self.slides and not any(self.aside)
+
     def slower(self, share: float) -> Move:
         """Return the same move with ``share`` of the speed: to the square of it as high and as far."""
         return dataclasses.replace(

@@ -429,3 +429,10 @@ def test_what_falls_over_in_a_rehearsal_hops_calmly_and_else_stays(table, tmp_pa
     bake = physgen.bake(motion.applied(scene), out=tmp_path / "1", options=rehearsal_options(motion, BakeOptions()))
     assert rehearsed(scene, bake, motion).toppled == ()
     assert default_motion(scene, still=["box0"]).moves == ()
+
+
+def test_what_is_narrow_and_alone_does_not_hop_on_the_spot_twice_in_a_row(table):
+    motion = default_motion(table([(0, 0, 0, 0.03, 0.03, 0.14)]))
+    assert motion.moves and any(move.on_the_spot for move in motion.moves)
+    pairs = zip(motion.moves, motion.moves[1:], strict=False)
+    assert not any(one.on_the_spot and other.on_the_spot for one, other in pairs)
