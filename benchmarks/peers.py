@@ -230,7 +230,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "instead, simulate what `physgen export` writes, in Newton with N steps a second (240 is fine)"
     parser.add_argument("--usd", type=int, metavar="N", help=text)
     steps = "our longest substeps in seconds, a row each; the first is the bake's (default: %(default)s)"
-    parser.add_argument("--max-step", type=float, nargs="+", default=[5e-4, 1e-3], help=steps)
+    parser.add_argument("--max-step", type=float, nargs="+", default=[1e-3, 5e-4], help=steps)
     parser.add_argument("--repeats", type=int, default=2, help="pairs of runs (default: %(default)s)")
     return parser
 

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..scene.folder import Scene
 from ..validation import quantity, to_json
 
-ENGINE_REVISION = 16
+ENGINE_REVISION = 17
 """Raised with every change of the engine or the skinning that changes what a scene does."""
 
 

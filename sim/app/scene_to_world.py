@@ -28,7 +28,7 @@ from ..errors import InputError
 from ..memory import ENGINE_RESERVED, available_memory
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
-from ..mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
+from ..mpm.cost_estimate import Estimate, estimate, longest_step, refuse_excess, stable_step
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, sample_interior
 from ..mpm.implicit_choice import may_pay, why_explicit
 from ..mpm.solver_options import SolverOptions
@@ -271,6 +271,7 @@ def prepare_world(
         contacts=contact_table(scene),
     )
     setup = apply_effects(setup, scene.effects)
+    solver = dataclasses.replace(solver, max_step=longest_step(setup.bodies, solver))
     step = stable_step(setup.bodies, cell, solver)
     explicit_because = why_explicit(setup)
     stiff = options.implicit and may_pay(setup, step, cell)

@@ -3,12 +3,12 @@
 
 import numpy as np
 import pytest
-from physgen.sim.constitutive import ElasticMaterial, RigidMaterial
+from physgen.sim.constitutive import ElasticMaterial, RigidMaterial, SandMaterial
 from physgen.sim.errors import InputError
 from physgen.sim.mpm import cost_estimate as module
 from physgen.sim.mpm.bodies import BodyParticles
 from physgen.sim.mpm.colliders import Surface, Track
-from physgen.sim.mpm.cost_estimate import Estimate, estimate, refuse_excess, stable_step
+from physgen.sim.mpm.cost_estimate import Estimate, estimate, longest_step, refuse_excess, stable_step
 from physgen.sim.mpm.solver_options import SolverOptions
 
 POINTS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)])
@@ -32,6 +32,17 @@ def test_the_time_step_is_that_of_the_fastest_wave_or_particle():
     skin = Surface(vertices=POINTS, faces=np.array([[0, 1, 2]]))
     rigid = a_body(material=RigidMaterial(density=500.0), surface=skin)
     assert stable_step([rigid], 0.01, options) == options.max_step
+
+
+def test_sand_alone_takes_longer_steps_and_never_shorter_than_asked_for():
+    options = SolverOptions()
+    sand = SandMaterial(density=1600.0, youngs_modulus=3.5e5, poisson_ratio=0.3, friction_angle=0.6)
+    pile, cube = a_body(material=sand), a_body()
+    later = a_body(materials=(sand,), material_track=((1.0, 1),))
+    assert longest_step([pile, pile], options) == 1e-3
+    for bodies in ([pile, cube], [cube], [later]):
+        assert longest_step(bodies, options) == options.max_step == 5e-4
+    assert longest_step([pile], SolverOptions(max_step=2e-3)) == 2e-3
 
 
 def test_cost_grows_with_particles_duration_and_substeps(monkeypatch):
