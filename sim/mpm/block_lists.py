@@ -40,30 +40,20 @@ class BlockLists:
     """
 
     def __init__(
-        self,
-        *,
-        field_count: int,
-        several: bool,
-        rigid_bodies: int,
-        flowing: bool,
-        fluid: bool,
-        lanes: Lanes,
-        windows: int,
+        self, *, field_count: int, rigid_bodies: int, flowing: bool, fluid: bool, lanes: Lanes, windows: int
     ) -> None:
-        """several: whether a world has several fields.
-
-        rigid_bodies: the most that one world has. flowing, fluid: whether any law needs past values of the nodes,
+        """rigid_bodies: the most that one world has. flowing, fluid: whether any law needs past values of the nodes,
         or the crowding of particles. lanes: threads that share a block. windows: at most, to read nodes from, where
         those do not lie in shared memory."""
         self._field_count, self._rigid_bodies, self._lanes = field_count, rigid_bodies, lanes
         self._flowing, self._fluid, self._windows = flowing, fluid, windows
-        self._several = several
         self._g_starts = new_array(ti.i32, field_count + 1)
         self._p_count = self._g_count = 0
         self._near = (0, 0)
         self._overlap = (0, 0, 0)
         self._p_capacity = self._g_capacity = 0
         self._allocate(LEAST_BLOCKS, 4 * LEAST_BLOCKS)
+        self._allocate_overlap(1, 1)
 
     def _allocate(self, p: int, g: int) -> None:
         """Make room for ``p`` particle blocks and ``g`` grid blocks, where there is less; contents are lost."""
@@ -76,8 +66,6 @@ class BlockLists:
             self._p_neighbours = new_array(ti.i32, p * 27)
             self._near_of_p, self._near_p = new_array(ti.i32, p), new_array(ti.i32, p)
             self._meets_p, self._meet_p = new_array(ti.i32, p), new_array(ti.i32, p)
-            self._pair_counts = new_array(ti.i32, p)
-            self._pairs = new_array(ti.i32, 3 * PAIRS * p if self._several else 1)
             self._touched, self._slack = new_array(ti.i32, p), new_array(ti.f32, p)
             self.pushes = new_array(ti.f32, max(1, p * self._rigid_bodies * PUSH))
             read = 1 if self._lanes.shared else min(p, self._windows) * WINDOW_NODES
@@ -102,13 +90,16 @@ class BlockLists:
             crowded = max(1, g * self._rigid_bodies * PUSH) if self._fluid else 1
             self._crowd_pushes = new_array(ti.f32, crowded)
             self._masses = new_array(ti.f32, g * BLOCK_NODES)
-            met = g if self._several else 1
-            self._met_around, self._lead_fields = new_array(ti.i32, met * 27), new_array(ti.i32, met)
-            self._faces = new_array(vec4, met * BLOCK_NODES)
-            self._others = new_array(ti.f32, met * BLOCK_NODES)
             self._block_sums = new_array(ti.f32, g * SUMS)
             self._g_mask = (1 << math.ceil(math.log2(4 * g))) - 1
             self._g_keys, self._g_slots = new_array(ti.i64, self._g_mask + 1), new_array(ti.i32, self._g_mask + 1)
+
+    def _allocate_overlap(self, p: int, g: int) -> None:
+        """Make room for ``p`` particle blocks and ``g`` grid blocks where bodies meet; contents are lost."""
+        self._met_p_capacity, self._met_g_capacity = p, g
+        self._pair_counts, self._pairs = new_array(ti.i32, p), new_array(ti.i32, 3 * PAIRS * p)
+        self._met_around, self._lead_fields = new_array(ti.i32, g * 27), new_array(ti.i32, g)
+        self._faces, self._others = new_array(vec4, g * BLOCK_NODES), new_array(ti.f32, g * BLOCK_NODES)
 
     @property
     def device_bytes(self) -> int:
@@ -184,6 +175,12 @@ class BlockLists:
             list_overlap = broad_phase.list_overlap_blocks_in_parallel if parallel else broad_phase.list_overlap_blocks
             found = list_overlap(worlds, blocks, grid, self._g_table, self.overlap_blocks)
             self._overlap = (int(found[0]), int(found[1]), int(found[2]))
+            p, g = self._overlap[2], self._overlap[0]
+            if p > self._met_p_capacity or g > self._met_g_capacity:
+                # Few blocks of most worlds: room for all of them would be a fifteenth of a particle's bytes.
+                self._allocate_overlap(int(GROWTH * p) + LEAST_BLOCKS, int(GROWTH * g) + LEAST_BLOCKS)
+            if g:
+                broad_phase.link_overlap_blocks.launch(grid, self._g_table, self.overlap_blocks)
 
     # ---- what the host reads ------------------------------------------------------------------------------------
 

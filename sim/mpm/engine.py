@@ -155,7 +155,6 @@ class Engine:
         self._targets = new_array(ti.i32, self._capacity)
         self._blocks = BlockLists(
             field_count=self.field_count,
-            several=self._several,
             rigid_bodies=self._most_rigid_bodies,
             flowing=models.flowing,
             fluid=bool(models.volumetric),

@@ -192,10 +192,6 @@ def list_overlap_blocks_in_parallel(
             slot = ti.atomic_add(grid_count, 1)
             overlap.slot[g] = slot
             overlap.grid_blocks[slot] = g
-    for s in range(grid_count):
-        link_overlap(s, grid, table, overlap)
-    for n in range(lead_count):
-        name_leads(n, grid, overlap)
     for k in range(blocks.count):
         overlap.chosen[k] = 0
         if overlaps_around(k, blocks, overlap):
@@ -223,10 +219,6 @@ def list_overlap_blocks(
             overlap.slot[g] = found[0]
             overlap.grid_blocks[found[0]] = g
             found[0] += 1
-    for s in range(found[0]):
-        link_overlap(s, grid, table, overlap)
-    for n in range(found[1]):
-        name_leads(n, grid, overlap)
     ti.loop_config(serialize=True)
     for k in range(blocks.count):
         overlap.chosen[k] = 0
@@ -235,3 +227,12 @@ def list_overlap_blocks(
             overlap.particle_blocks[found[2]] = k
             found[2] += 1
     return found
+
+
+@kernel
+def link_overlap_blocks(grid: GridBlocks, table: BlockTable, overlap: OverlapBlocks):
+    """Find what is around the listed grid blocks, and whose places they are in; ``table``: of the grid blocks."""
+    for s in range(overlap.grid_count):
+        link_overlap(s, grid, table, overlap)
+    for n in range(overlap.lead_count):
+        name_leads(n, grid, overlap)

@@ -175,10 +175,10 @@ class OverlapBlocks(NamedTuple):
     """(grid_count, BLOCK_NODES) share of all other fields at the nodes of ``grid_blocks``."""
 
     pair_counts: Integers
-    """(P,) pairs of particles that a block has found, see ``particle_pairs``."""
+    """(particle_count,) pairs of particles that a block has found, see ``particle_pairs``."""
 
     pairs: Integers
-    """(P, PAIRS, 3) a particle of the block, the block of its partner, and the partner."""
+    """(particle_count, PAIRS, 3) a particle of the block, the block of its partner, and the partner."""
 
 
 class ParticleState(NamedTuple):

@@ -172,7 +172,7 @@ def list_pairs(
     """List the pairs of particles that are too near, block by block, to ``overlap.pairs``; ``table``: of the particle
     blocks."""
     for s in range(overlap.particle_count):
-        overlap.pair_counts[overlap.particle_blocks[s]] = 0
+        overlap.pair_counts[s] = 0
     for ss in range(overlap.particle_count * ti.static(lanes.span)):
         lane = ss % ti.static(lanes.span)
         if lane < ti.static(lanes.threads):
@@ -187,7 +187,9 @@ def list_pairs(
                 while p < blocks.starts[k + 1]:
                     gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
                     if others_at(lanes, k, gp, blocks, overlap, nodes) > deep:
-                        list_partners(p, k, w, gp, worlds, blocks, overlap, particles, table)
+                        list_partners(
+                            p, k, ss // ti.static(lanes.span), w, gp, worlds, blocks, overlap, particles, table
+                        )
                     p += ti.static(lanes.threads)
 
 
@@ -195,6 +197,7 @@ def list_pairs(
 def list_partners(
     p: ti.i32,
     k: ti.i32,
+    s: ti.i32,
     w: ti.i32,
     gp: vec3,
     worlds: WorldArrays,
@@ -203,8 +206,8 @@ def list_partners(
     particles: ParticleArrays,
     table: BlockTable,
 ):
-    """List the particles of other fields of world ``w`` that are too near to ``p``, at ``gp`` in block ``k``'s
-    window."""
+    """List the particles of other fields of world ``w`` that are too near to ``p``, at ``gp`` in the window of block
+    ``k``, which is the overlap block ``s``."""
     first = worlds.integers[w * WORLD_INTEGERS + FIRST_FIELD]
     count = worlds.integers[w * WORLD_INTEGERS + FIELDS]
     for d in range(27):
@@ -220,9 +223,9 @@ def list_partners(
                             apart = at - ti.cast(particles.x[q], ti.f32) * (1.0 / FIXED_ONE)
                             if apart.norm_sqr() < FARTHEST * FARTHEST:
                                 if apart.norm() < least_distance(p, q, particles):
-                                    n = ti.atomic_add(overlap.pair_counts[k], 1)
+                                    n = ti.atomic_add(overlap.pair_counts[s], 1)
                                     if n < PAIRS:
-                                        row = (k * PAIRS + n) * 3
+                                        row = (s * PAIRS + n) * 3
                                         overlap.pairs[row] = p
                                         overlap.pairs[row + 1] = near
                                         overlap.pairs[row + 2] = q
@@ -263,8 +266,8 @@ def part_pairs_of(
     if worlds.control[w * CONTROL_ROW + PHASE] == FULL:
         dt = ti.cast(worlds.control[w * CONTROL_ROW + STEP], ti.f32)
         recovery = worlds.numbers[w * WORLD_ROW + RECOVERY_SPEED]
-        for n in range(ti.min(overlap.pair_counts[k], PAIRS)):
-            row = (k * PAIRS + n) * 3
+        for n in range(ti.min(overlap.pair_counts[s], PAIRS)):
+            row = (s * PAIRS + n) * 3
             p, near, q = overlap.pairs[row], overlap.pairs[row + 1], overlap.pairs[row + 2]
             side = ti.cast(4 * (blocks.cells[near] - blocks.cells[k]), ti.f32)
             gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
