@@ -11,6 +11,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
+from physgen.sim.mpm.colliders import Surface
+from physgen.sim.mpm.geometry.mesh_checks import check_surface
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.shape.object_bodies import build_body
@@ -258,3 +260,13 @@ def test_floating_parts_are_removed_and_measured():
     assert len(points) == len(large.vertices)
     assert lost == pytest.approx(0.2, abs=0.01)
     assert trimesh.Trimesh(points, faces, process=False).volume == pytest.approx(large.volume)
+
+
+def test_a_can_whose_mask_lacks_a_corner_does_not_cross_itself():
+    mask = outline(CAN)
+    rows, columns = np.nonzero(mask)
+    mask[: rows.min() + 14, columns.max() - 30 :] = False
+    body = made(mask, shape="cylinder")
+    checked(body)
+    assert body.fit > 0.98
+    assert check_surface(Surface(vertices=body.mesh.vertices, faces=body.mesh.faces), name="can") == ()

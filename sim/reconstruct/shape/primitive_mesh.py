@@ -42,6 +42,10 @@ PART = (2.5, 0.02)
 """Least protrusion of a part: pixels, and share of the object's size; the larger one."""
 REACH = 1.5
 """Depth of parts inside the primitive, over the radius of their widest inscribed circle."""
+SQUEEZED, UNFOLDED_RIM = 0.2, 3.0
+"""Area that a warp leaves of a pixel at least, and how far outside of the primitive, in pixels, that holds."""
+UNFOLDING, UNFOLDING_ROUNDS = (1.5, 10.0), 16
+"""Standard deviations of the smoothing where a warp folds, in pixels, from the first to the last of so many rounds."""
 SMALLEST_PART = 0.002
 """Least area of a part over the object's."""
 
@@ -81,9 +85,22 @@ def warp_to_outline(crop: Crop, primitive: Mask, *, smooth: float = SMOOTH, fade
         nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
         outward = ndimage.gaussian_filter(apart[tuple(nearest)], max(1.5, smooth * size))
     weight = smoothstep(1.0 - own / max(fade * float(own.max()), 1e-9))
-    shift = np.moveaxis(towards * (outward * weight), 0, -1)
+    shift = np.moveaxis(_unfolded(towards * (outward * weight), own > -UNFOLDED_RIM), 0, -1)
     parts, reach = _parts(mask, own + outward, size)
     return OutlineWarp(shift=shift, parts=parts, fade=np.clip(1.0 - (own + outward) / reach, 0.0, 1.0))
+
+
+def _unfolded(shift: Field, where: Mask) -> Field:
+    """``shift`` (2, h, w), smoothed around the pixels of ``where`` (h, w) at which moving back by it would squeeze or
+    fold the picture: a surface that follows it would cross itself."""
+    for sigma in np.geomspace(*UNFOLDING, UNFOLDING_ROUNDS):
+        (xx, xy), (yx, yy) = ((gradient[1], gradient[0]) for gradient in (np.gradient(part) for part in shift))
+        folded = ((1.0 - xx) * (1.0 - yy) - xy * yx < SQUEEZED) & where
+        if not folded.any():
+            break
+        share = np.clip(3.0 * ndimage.gaussian_filter(folded.astype(float), sigma) * sigma, 0.0, 1.0)
+        shift = shift + share * (ndimage.gaussian_filter(shift, (0.0, sigma, sigma)) - shift)
+    return shift
 
 
 def _gradient(field: Field) -> Field:
