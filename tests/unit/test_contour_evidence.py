@@ -113,6 +113,36 @@ def test_a_thin_rod_survives():
     assert overlap(mask, truth) > 0.93
 
 
+def armchair(leg):
+    """A seat of blue cloth before a pale wall and floor, on legs 5 pixels wide and 30 long of the colour ``leg``."""
+    legs = np.zeros((HEIGHT, WIDTH), bool)
+    for x in (114, 160, 206):
+        legs[160:190, x : x + 5] = True
+    image = np.full((HEIGHT, WIDTH, 3), (214.0, 212, 218))
+    image[150:] = (203, 202, 208)
+    image += np.random.default_rng(5).normal(scale=2, size=(HEIGHT, WIDTH, 1))
+    image[60:160, 105:220] = (58, 84, 128)
+    image[legs] = leg
+    return image, legs
+
+
+@pytest.mark.parametrize("leg", [(176, 140, 96), (150, 100, 60)])
+def test_legs_of_a_colour_that_the_seat_has_nowhere_carry_it(leg):
+    image, legs = armchair(leg)
+    mask = segment(finished(image), (90, 45, 236, 202), "chair")
+    assert mask[ndimage.binary_erosion(legs)].mean() > 0.9
+    assert mask[165:185, 125:155].mean() < 0.05
+    assert mask[64:156, 110:215].mean() > 0.97
+
+
+def test_a_strip_of_shade_and_a_post_beside_are_no_legs():
+    image, _ = armchair((112, 111, 114))
+    # A post that stands behind goes on above the seat's foot.
+    image[90:190, 222:227] = (176, 140, 96)
+    mask = segment(finished(image), (90, 45, 236, 202), "seat")
+    assert mask[164:190].mean() < 0.01
+
+
 def winged(seed=0):
     """A yellow body with a grey wing that reaches its outline at the left, on grey ground in whose shade the wing would
     not stand out, and the body's shadow."""

@@ -247,6 +247,9 @@ def test_what_is_cut_or_tiny_is_used_where_there_is_nothing_else():
     assert with_the_rest_aside(masks_of(cut, speck), scores[1:], [0.0] * 2) == [0.97, LEFT_ASIDE]
     assert with_the_rest_aside(masks_of(speck), scores[2:], [0.0]) == [0.99]
     assert with_the_rest_aside([], [], []) == []
+    # A car far behind is left aside, an orange beside a book is not.
+    far, orange = (120, 0, 132, 12), (120, 60, 138, 78)
+    assert with_the_rest_aside(masks_of(whole, far, orange), [0.99, 0.98, 0.98], [0.0] * 3) == [0.99, LEFT_ASIDE, 0.98]
     # A poor one neither makes others tiny nor is raised.
     poor = (0, 0, 190, 99)
     assert with_the_rest_aside(masks_of(poor, speck), [0.6, 0.99], [0.0, 0.0]) == [0.6, 0.99]

@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 import pytest
-from physgen.sim.reconstruct.segmentation.whole_objects import Candidate, whole_objects
+from physgen.sim.reconstruct.segmentation.whole_objects import Candidate, stacked_parts, whole_objects
 
 SHAPE = (120, 160)
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -67,3 +67,16 @@ def test_the_shadow_alone_is_no_object_beside_its_owner():
     alone = cast & ~FRONT
     colours = [(alone, (150, 135, 112)), (FRONT, RED)]
     assert chosen([FRONT | cast, FRONT, alone], colours, [0.99, 0.97, 0.85], shade=[2]) == [1]
+
+
+def test_a_lid_is_of_its_jar_and_what_stands_on_a_thing_or_beside_it_is_not():
+    jar, lid, cup = block(40, 60, 90, 110), block(36, 40, 94, 60), block(50, 20, 70, 40)
+    beside = block(90, 50, 120, 110)
+    # A cup on a lid, a plate below a jar, and a neighbour are things of their own.
+    assert stacked_parts([jar, cup, lid, beside]) == [[1], [2, 0], [3]]
+    assert stacked_parts([block(20, 110, 130, 116), jar]) == [[0], [1]]
+    # Three slices of one thing, in any order.
+    slices = [block(40, y, 90, y + 20) for y in (60, 20, 40)]
+    assert sorted(stacked_parts(slices)[0]) == [0, 1, 2]
+    # A shelf's width apart they are two.
+    assert stacked_parts([jar, block(40, 30, 90, 52)]) == [[0], [1]]

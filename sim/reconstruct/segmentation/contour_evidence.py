@@ -240,6 +240,12 @@ LONG = 0.12
 """Least length of a gap over the object's size: letters printed on a cover are shorter."""
 THIN = 0.05
 """Largest width of a rod over the object's size."""
+LEG, UPRIGHT = 0.12, 1.8
+"""Largest width of a leg over the object's size, and least height over its width."""
+SEAM = 4
+"""Pixels between a leg and what it carries, whose colours are mixed."""
+UNKNOWN = 3.0
+"""Log likelihood of colours that the object has nowhere else, below that of unusual ground: those of legs."""
 SOLID, SOLID_SHARE = 0.16, 0.25
 """Width over the object's size from which a part of it is no slat or post, and the share of such parts around a gap
 above which it is none: the inside of a cup and a shade on it have the ground's colours, too.
@@ -298,10 +304,47 @@ def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None
         if shade is not None and shade()[part].mean() > SHADE_SHARE:
             continue
         rods |= part
+    legs = _legs(view, mask, (usual - UNKNOWN) - ground, crest)
+    if shade is not None and legs:
+        # Where a leg's colours and the ground's are mixed, they look like shade.
+        legs = [part for part in legs if shade()[_core(part)].mean() < SHADE_SHARE]
+    rods = np.logical_or.reduce([rods, *legs])
     if gaps.sum() > 0.8 * mask.sum():
         return nothing, rods
     # What only a gap's edge held in place goes with it.
     return gaps, rods & touching(rods | (mask & ~gaps), mask & ~gaps)
+
+
+def _legs(view: BoxCrop, mask: Mask, unlike: NDArray[np.floating], crest: NDArray[np.floating]) -> list[Mask]:
+    """Return parts (h, w) below the object ``mask`` that carry it: thin, upright, on edges, of any colour but the
+    ground's. Chairs of cloth have legs of wood.
+
+    unlike: (h, w) log likelihood ratio of a colour that is nowhere else, over the ground. crest: (h, w) gradient.
+    """
+    size = float(np.sqrt(mask.sum()))
+    window = view.inside | mask
+    ratio = np.where(window, np.clip(unlike, -4.0, 4.0), 0.0).astype(np.float32)
+    cut = graph_cut(ratio, principal_contrast(view.lab), 1.0, barred=~window)
+    free = cut & view.inside & ~_around(mask, 1) & ~mask
+    result = []
+    for part, (_, top, _, height) in _parts(free, 16):
+        width = 2.0 * float(cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
+        if not (height > UPRIGHT * width and height > 0.06 * size and width < LEG * size):
+            continue
+        joint = np.flatnonzero((_around(part, SEAM) & mask).any(axis=1))
+        rim = _around(part, 1) & ~mask
+        hangs = len(joint) > 0 and joint[-1] < top + 0.25 * height
+        if hangs and rim.any() and (crest[rim] > CREST).mean() > 0.6:
+            # With the mixed pixels between them.
+            seam = _around(part, SEAM) & _around(mask, SEAM) & view.inside & part.any(axis=0)
+            result.append(part | seam)
+    return result
+
+
+def _core(part: Mask) -> Mask:
+    """``part`` without its outermost pixels, unless nothing would be left."""
+    inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    return inner if inner.any() else part
 
 
 def _between_slats(mask: Mask, candidates: Sequence[Mask], size: float) -> Mask:

@@ -38,7 +38,7 @@ from .proposal_features import (
     solidity_of,
 )
 from .round_things import round_things
-from .whole_objects import Candidate, whole_objects
+from .whole_objects import Candidate, stacked_parts, whole_objects
 
 Pixels = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
@@ -57,8 +57,9 @@ ELSEWHERE = 0.4
 """Share of the smaller of two boxes in the other above which they hold the same object, or a part of it."""
 LEAST_SIDE = 0.035
 """Least side of an object's box over the photo's shorter side."""
-BESIDE = 0.03
-"""Area over the largest object's below which a thing is left aside: a pebble beside a toy."""
+BESIDE = 0.06
+"""Area over the largest object's below which a thing is left aside: a pebble beside a toy, a car far behind a hydrant.
+An orange beside a book has 0.10."""
 CUT = 0.02
 """Share of its box' outline on the photo's border from which a thing is cut."""
 SIDES = 0.02
@@ -98,13 +99,15 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     )
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
+    things = [[found[whole[k]] for k in group] for group in stacked_parts([found[i][0].mask for i in whole])]
+    masks = [np.logical_or.reduce([item.mask for item, _ in parts]) for parts in things]
     listed = with_the_rest_aside(
-        [found[i][0].mask for i in whole],
-        [found[i][1] for i in whole],
-        [float(found[i][0].features[ground]) for i in whole],
+        masks,
+        [max(value for _, value in parts) for parts in things],
+        [min(float(item.features[ground]) for item, _ in parts) for parts in things],
     )
-    for item, value in sorted(zip((found[i][0] for i in whole), listed, strict=True), key=lambda pair: -pair[1])[:most]:
-        x0, y0, x1, y1 = _loose(extent_of(item.mask), size)
+    for mask, value in sorted(zip(masks, listed, strict=True), key=lambda pair: -pair[1])[:most]:
+        x0, y0, x1, y1 = _loose(extent_of(mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
     alike = round_things(pixels, result, LEFT_ASIDE + 0.01)

@@ -29,6 +29,11 @@ WHOLE = 0.12
 """Score that e times the area is worth when two candidates overlap."""
 
 
+FLUSH, SEAM = 0.7, 3
+"""Share of the lower outline of a part that lies on the one below, and of that one's upper outline that lies under it,
+from which both are one thing; and how many pixels may be between them."""
+
+
 class Candidate(NamedTuple):
     """mask: (h, w). score: 0 to 1. shade: whether it may be nothing but shade on what surrounds it."""
 
@@ -63,6 +68,40 @@ def whole_objects(found: Sequence[Candidate], lab: NDArray[np.float32]) -> list[
         if all(not _same_or_part(found[i].mask, extents[j]) for j in result):
             result.append(i)
     return result
+
+
+def stacked_parts(masks: Sequence[Mask]) -> list[list[int]]:
+    """Return the numbers of ``masks`` (h, w), those together that are parts of one thing: a lid on its jar.
+
+    Two things rarely end at the same place on both sides where one stands on the other (a generic view; Freeman, Nature
+    1994), and the one would carry the other along.
+    """
+    groups = [[i] for i in range(len(masks))]
+    for upper, above in enumerate(masks):
+        for lower, below in enumerate(masks):
+            if upper == lower or not _flush(above, below):
+                continue
+            first = next(group for group in groups if upper in group)
+            second = next(group for group in groups if lower in group)
+            if first is not second:
+                first += second
+                groups.remove(second)
+    return groups
+
+
+def _flush(above: Mask, below: Mask) -> bool:
+    """Whether all of the underside of ``above`` lies on ``below``, all of whose top lies under it."""
+    height = len(above)
+    steps = np.arange(1, SEAM + 1)[:, None]
+    columns = np.flatnonzero(above.any(axis=0))
+    lowest = height - 1 - above[::-1, columns].argmax(axis=0)
+    carried = below[np.minimum(height - 1, lowest + steps), columns].any(axis=0)
+    if carried.mean() < FLUSH:
+        return False
+    columns = np.flatnonzero(below.any(axis=0))
+    highest = below[:, columns].argmax(axis=0)
+    covered = above[np.maximum(0, highest - steps), columns].any(axis=0)
+    return bool(covered.mean() >= FLUSH)
 
 
 def _within(mask: Mask, other: Mask) -> float:
