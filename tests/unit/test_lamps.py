@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from physgen.sim.composite.srgb import bytes_to_linear
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 from physgen.sim.reconstruct.lighting.ground_lighting import MAX_SHARE
 from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps, ground_axes
 from physgen.sim.reconstruct.lighting.light_estimate import KEY_SHARE, KEY_SPREAD, with_soft_key, with_spots
+from physgen.sim.reconstruct.lighting.standing_surface import ground_before, standing_surface
 from physgen.sim.scene.environment import ground_light, lamps_in
 from physgen.sim.scene.model import Ground
 
@@ -133,6 +135,40 @@ def test_other_things_on_the_ground_are_no_ground():
     (lamp,) = estimate_lamps(CAMERA, Ground(), pixels, [mask], [mesh], things=things)
     assert math.degrees(math.acos(min(1.0, float(np.dot(lamp.direction, direction))))) < 8.0
     assert lamp.share == pytest.approx(0.5, abs=0.15)
+
+
+def before_water(lamps):
+    """``photo`` whose ground is a pale stone that ends behind the ball, in a wavy edge, at dark green water."""
+    pixels, mask, mesh = photo(lamps)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    stone = rows > 105.0 + 12.0 * np.sin(columns / 25.0)
+    water = np.clip(np.random.default_rng(2).normal((38, 50, 30), 3.0, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)
+    pale = (pixels * np.array([1.0, 0.93, 0.86])).astype(np.uint8)
+    return np.where((stone | mask)[..., None], pale, water), mask, mesh, stone
+
+
+def test_a_lamp_is_found_on_a_stone_that_ends_before_water():
+    direction = towards(350.0, 40.0)
+    pixels, mask, mesh, _ = before_water([(direction, 0.5)])
+    (lamp,) = estimate_lamps(CAMERA, Ground(), pixels, [mask], [mesh])
+    assert math.degrees(math.acos(min(1.0, float(np.dot(lamp.direction, direction))))) < 8.0
+    assert lamp.share == pytest.approx(0.5, abs=0.15)
+    pixels, mask, mesh, _ = before_water([])
+    assert estimate_lamps(CAMERA, Ground(), pixels, [mask], [mesh]) == ()
+
+
+@pytest.mark.parametrize("azimuth", [80.0, 350.0])
+def test_a_surface_ends_where_its_tint_does_and_not_in_a_shadow(azimuth):
+    pixels, mask, (body, _), stone = before_water([(towards(azimuth, 35.0), 0.8)])
+    colour = np.log(np.maximum(bytes_to_linear(pixels), 1e-3).astype(np.float64))
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    places = on_ground(CAMERA, np.stack([x, y], axis=-1))[..., :2]
+    before = ground_before(places.reshape(-1, 2), CAMERA.position[:2], [body]).reshape(mask.shape) & ~mask
+    surface = standing_surface(colour, ~mask, before)
+    assert surface[stone & ~mask].mean() > 0.98
+    assert surface[~stone & ~mask].mean() < 0.03
+    # With nothing before the objects it cannot be told.
+    assert (standing_surface(colour, ~mask, np.zeros_like(mask)) == ~mask).all()
 
 
 def test_a_soft_key_gives_its_share_of_the_grounds_light_from_around_the_zenith():

@@ -28,6 +28,7 @@ from .ground_lighting import (
     sun_disc,
     surface_points,
 )
+from .standing_surface import ground_before, standing_surface
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -96,7 +97,8 @@ def observe_ground(
     shrink = min(1.0, OBJECT_SIDE / _largest_side(masks), LONGEST_SIDE / max(width, height))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     linear = bytes_to_linear(pixels)
-    luminance = cv2.resize(linear @ LUMINANCE_F32, size, interpolation=cv2.INTER_AREA)
+    light = np.asarray(cv2.resize(linear, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    luminance = light @ LUMINANCE_F32
     objects = np.logical_or.reduce(masks if things is None else [*masks, things])
     bright, black = pixels.max(axis=2) >= 254, pixels.max(axis=2) <= 2
     beside = bright[_beside(masks) & ~objects]
@@ -123,6 +125,7 @@ def observe_ground(
             near |= outside < REACH * tall
     if near.sum() < MIN_POINTS:
         return None
+    near &= _standing(light, rows, columns, near, ground_before(flat, eye[:2], surfaces))
     blank = near & white[rows, columns]
     most = max(MIN_POINTS, WHITE_SHARE * int((near & ~blank).sum()))
     if blank.sum() > most:
@@ -147,6 +150,20 @@ def observe_ground(
         size=size,
         white=white[rows[index], columns[index]],
     )
+
+
+def _standing(
+    light: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64], near: Mask, before: Mask
+) -> Mask:
+    """Which (N,) of the pixels ``rows``, ``columns`` show the surface on which the objects stand.
+
+    light: (h, w, 3) linear. near: (N,) those that count as ground; before: (N,) those close before the objects.
+    """
+    pictures = [np.zeros(light.shape[:2], dtype=bool) for _ in range(2)]
+    for picture, values in zip(pictures, (near, before & near), strict=True):
+        picture[rows, columns] = values
+    surface = standing_surface(np.log(np.maximum(light, 1e-3).astype(np.float64)), *pictures)
+    return surface[rows, columns] if surface.sum() >= MIN_POINTS else near
 
 
 def _beside(masks: Sequence[Mask]) -> Mask:
@@ -180,6 +197,9 @@ MIN_STRENGTH = 0.12
 MIN_CLEARNESS = 7.0
 """Without a sun, the best direction on a patchy ground reaches about 3; photos with other objects, whose shadows are
 unknown, reach 6."""
+OUTLYING = 3.0
+"""Residual over the texture's beyond which a point counts as that far off: the fit is robust, and a strip of the
+object that its mask lacks must not decide either."""
 MOST_LAMPS = 3
 LEAST_GAIN = 0.04
 """Least share of the misfit that a further lamp explains."""
@@ -321,7 +341,7 @@ class _Search:
         reaching, light = self.final(lamps)
         found = []
         for index, lamp in enumerate(lamps):
-            clear = _clearness(self._whole, reaching, index, light)
+            clear = _clearness(self._whole, reaching, index, light, OUTLYING * self._scale)
             rest = 1.0 - sum(light.shares)
             if light.shares[index] >= MIN_STRENGTH * max(rest, 1e-6) and clear >= MIN_CLEARNESS:
                 found.append((lamp, light.shares[index], clear))
@@ -341,10 +361,11 @@ def _angle_or_usual(cost: Callable[[Points], float], best: Points) -> float:
     return float(usual[2] if cost(usual) <= cost(best) * 1.002 else best[2])
 
 
-def _clearness(view: GroundObservation, lamps: Sequence[Points], index: int, light: GroundLight) -> float:
+def _clearness(view: GroundObservation, lamps: Sequence[Points], index: int, light: GroundLight, most: float) -> float:
     """Darkness of a lamp's shadow over that of the ground's texture alone in patches of the same shape.
 
-    lamps: for each lamp, the share (N,) of its light that reaches the points; index: which one.
+    lamps: for each lamp, the share (N,) of its light that reaches the points; index: which one. most: residual of log
+    brightness beyond which a point counts as that far off.
     """
     shade = 1.0 - lamps[index]
     if shade.sum() < 1.0:
@@ -356,8 +377,9 @@ def _clearness(view: GroundObservation, lamps: Sequence[Points], index: int, lig
     )
     drop = np.log((others + light.shares[index]) / (others + light.shares[index] * lamps[index]))
     dark = float((drop * shade).sum() / shade.sum())
+    residual = np.clip(light.residual, -most, most)
     known, shaded, rest = (np.zeros(view.size[::-1], dtype=np.float32) for _ in range(3))
-    for picture, values in ((known, 1.0), (shaded, shade), (rest, light.residual)):
+    for picture, values in ((known, 1.0), (shaded, shade), (rest, residual)):
         picture[view.rows, view.columns] = values
     # Only some of the pixels were sampled; interpolate the shadow between them.
     near = [cv2.GaussianBlur(picture, (0, 0), 2.0) for picture in (shaded, known)]
