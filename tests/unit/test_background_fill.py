@@ -188,3 +188,40 @@ def test_behind_a_thing_a_plain_backdrop_goes_on_without_a_stain_or_an_edge(whit
     hole = cv2.dilate((thing | (shade > 0.02)).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     filled = fill_background(picture, hole, thing, camera(20.0))
     assert decibels(filled, np.clip(truth, 0, 255), hole) > 36.0
+
+
+def hill(sag, seed=2):
+    """A pale stone before dark water: photo uint8, rows of its outline (W,), truth below, and what stands before it."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    outline = 62.0 + sag * np.square((columns[0] - 95.0) / 50.0) + 0.05 * columns[0]
+    stone = rows > outline
+    truth = np.where(stone[..., None], (190.0, 165.0, 140.0), (40.0, 48.0, 36.0))
+    truth = truth + rng.normal(scale=np.where(stone, 6.0, 1.5)[..., None], size=truth.shape)
+    thing = (np.abs(columns - 100.0) < 22.0) & (rows > 30.0) & (rows < 110.0)
+    photo = np.clip(truth, 0, 255).astype(np.uint8)
+    photo[thing] = (60, 150, 200)
+    return photo, outline, stone, thing
+
+
+@pytest.mark.parametrize("sag", [12.0, -9.0], ids=["hill", "hollow"])
+def test_a_curved_outline_joins_both_of_its_ends_behind_the_object(sag):
+    photo, outline, stone, thing = hill(sag)
+    hole = cv2.dilate(thing.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    (edge,) = edges_behind(logarithms(photo.astype(np.float32)), hole, thing)
+    columns = np.flatnonzero(hole.any(axis=0))
+    behind = (edge.height(hole.shape) <= 0.0).sum(axis=0)[columns]
+    # A straight line through both ends is off by 3 pixels or more, in the middle.
+    chord = np.interp(columns, columns[[0, -1]], outline[columns[[0, -1]]])
+    assert np.abs(chord - outline[columns]).max() > 1.5 * np.abs(behind - outline[columns]).max()
+    assert np.abs(np.diff(behind)).max() <= 2.0
+    found = fill_background(photo, hole, thing, camera(20.0)).astype(float).mean(axis=-1)
+    assert ((found > 100.0) != stone)[hole].mean() < 0.03
+
+
+def test_an_outline_that_is_straight_stays_a_line():
+    for seed in range(4):
+        photo, _, _, thing = hill(0.0, seed)
+        hole = cv2.dilate(thing.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        (edge,) = edges_behind(logarithms(photo.astype(np.float32)), hole, thing)
+        assert edge.bend is None

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Edges between surfaces behind a hole: a wall on the floor, a skirting board, a table's or a shelf's edge.
 
-Such an edge is straight, visible on both sides of the hole, and separates different surfaces. The first is accepted
-only if two surfaces, each with its own smooth light, explain the colours much better than one. Further ones are lines
-across which the colour jumps alike on both sides of the hole: narrow bands, such as a skirting, have no light of their
-own to be told by.
+Such an edge is straight, or bends as it is traced beside the hole (``outline_tracing``). It is visible on both sides
+and separates different surfaces. The first is accepted only if two surfaces, each with its own smooth light, explain
+the colours much better than one. Further ones are lines across which the colour jumps alike on both sides of the hole:
+narrow bands, such as a skirting, have no light of their own to be told by.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from .outline_tracing import bend
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -51,15 +53,20 @@ ALIKE_DIM = 0.25
 
 @dataclass(frozen=True)
 class Edge:
-    """A line a x + b y = c in the photo, b > 0, a² + b² = 1, in pixels."""
+    """A line a x + b y = c in the photo, b > 0, a² + b² = 1, in pixels. bend: (W,) rows by which the edge lies below it
+    in each column of the photo, None where it is straight."""
 
     a: float
     b: float
     c: float
+    bend: NDArray[np.float32] | None = field(default=None, compare=False)
 
     def height(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Return the signed distance (H, W) of the pixels' centres in pixels, positive below."""
+        """Return the signed distance (H, W) of the pixels' centres in pixels, positive below; from a bent edge along
+        the line's normal, to first order."""
         y, x = np.ogrid[: shape[0], : shape[1]]
+        if self.bend is not None:
+            y = y - self.bend
         return np.asarray(self.a * (x + 0.5) + self.b * (y + 0.5) - self.c, dtype=np.float32)
 
     def below(self, shape: tuple[int, int]) -> Mask:
@@ -84,7 +91,7 @@ def edges_behind(logs: Picture, part: Mask, hidden: Mask, shaded: Mask | None = 
         deep = cv2.erode((dark | hidden).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         hidden, dark = hidden | (dark & ~deep), dark & deep
     for index, thing in enumerate(things):
-        edges = _edges_near(logs, thing, hidden, dark)
+        edges = _edges_near(logs, thing, hidden, dark, part)
         # One that passes behind a larger thing as well would have been found around that.
         edges = [edge for edge in edges if not any(_passes_behind(edge, larger) for larger in things[:index])]
         if edges:
@@ -109,8 +116,8 @@ def _things(part: Mask, hidden: Mask) -> list[Mask]:
     return [np.asarray(labels == index + 1) for index in order if areas[index] >= LEAST_THING * areas.max()]
 
 
-def _edges_near(logs: Picture, thing: Mask, hidden: Mask, shade: Mask) -> list[Edge]:
-    """Edges that pass behind ``thing`` (H, W)."""
+def _edges_near(logs: Picture, thing: Mask, hidden: Mask, shade: Mask, part: Mask) -> list[Edge]:
+    """Edges that pass behind ``thing`` (H, W), a thing in the hole ``part``."""
     rows, columns = _window(thing)
     known, inner, dark = ~hidden[rows, columns], thing[rows, columns], shade[rows, columns]
     values = np.where(known[..., None], logs[rows, columns], 0.0).astype(np.float32)
@@ -124,12 +131,18 @@ def _edges_near(logs: Picture, thing: Mask, hidden: Mask, shade: Mask) -> list[E
     strongest = 0.0 if first is None else float(np.linalg.norm(first[2]))
     found = _further_lines(values, known, inner, dark, found, strongest)
     width = columns.stop - columns.start
+    bent = None
+    # The lines of a skirting or a shelf are straight, as there are several.
+    if first is not None and len(found) == 1:
+        bent = bend(values, known & ~part[rows, columns], inner, found[0], first[2])
+        if bent is not None:
+            bent = np.pad(bent, (columns.start, hidden.shape[1] - columns.stop), mode="edge")
     edges = []
     for left, right in found:
         slope = (right - left) / width
         length = float(np.hypot(slope, 1.0))
         a, b = -slope / length, 1.0 / length
-        edges.append(Edge(a=a, b=b, c=a * columns.start + b * (left + rows.start)))
+        edges.append(Edge(a=a, b=b, c=a * columns.start + b * (left + rows.start), bend=bent))
     return edges
 
 
