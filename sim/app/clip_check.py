@@ -131,7 +131,7 @@ def _pace(tracks: Sequence[NDArray[np.float64]], cameras: Sequence[Camera], clip
             f"nothing moves in these {count} frames; give an object a velocity (--velocity right,away,up in m/s), or "
             "leave out --still"
         ]
-    moving = np.nonzero(np.maximum.reduce(steps) > STEP * max(cameras[0].width, cameras[0].height))[0]
+    moving = np.nonzero(np.maximum.reduce(steps) > _least_step(cameras[0]))[0]
     if len(moving) == 0:
         return []
     action, whole = (int(moving[-1]) + 1) / clip.fps, count / clip.fps
@@ -141,6 +141,11 @@ def _pace(tracks: Sequence[NDArray[np.float64]], cameras: Sequence[Camera], clip
     return [
         f"all motion is over after {action:.2g} s of {whole:.2g} s; slow motion shows it longer: --slow {fitting[-1]:g}"
     ]
+
+
+def _least_step(camera: Camera) -> float:
+    """Return the way in pixels from frame to frame below which nothing is seen to move."""
+    return STEP * max(camera.width, camera.height)
 
 
 def _flat(tracks: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
@@ -214,9 +219,8 @@ def rehearsed(
         steps = [np.linalg.norm(np.diff(track[..., :2], axis=0), axis=-1).max(axis=1) for track in tracks]
     speed = np.nan_to_num(np.maximum.reduce(steps)) * rate
     settles = {}
-    step = STEP * max(camera.width, camera.height)
     for each in SLOW:
-        moving = np.flatnonzero(speed > step * motion.fps * each)
+        moving = np.flatnonzero(speed > _least_step(camera) * motion.fps * each)
         end = (int(moving[-1]) + 1) / rate if len(moving) else 0.0
         settles[each] = max(0.0, end - motion.moves[-1].landed_s)
     clip = fitted(scene, motion.moves, settles, fps=motion.fps, frames=frames, slow=slow)

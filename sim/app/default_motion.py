@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Default motion of a scene at rest: its freest objects hop or slide where they have room, whole and in the picture.
+"""Default motion of a scene at rest: the objects with most room hop or slide, one after another, within the picture.
 
-Reconstruction stays true to the photo, in which everything is at rest; this is asked for separately (``physgen run``
-does, without a velocity, spin, moving override or ``--still``). One thing moves after another, and the last comes to
-rest where the clip ends. ``motion_stage.py`` chooses each move; a coarse run of the engine (``clip_check.py``) checks
-them where there is time for one. Nothing is drawn at random.
+A reconstructed scene is at rest, as the photo is. ``physgen run`` adds this motion unless a velocity, a spin, an
+override that moves something or ``--still`` is given. The clip ends when the last object has come to rest.
+``motion_stage.py`` chooses each move; where there is time, a coarse run of the engine checks them (``clip_check.py``).
+Nothing is random.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from .motion_stage import Stage
 from .moves import Move
 
 MOST_MOVES = 3
-"""Motions at most, one after another."""
+"""Most moves in a clip."""
 
 MIDDLES = {1: (0.375,), 2: (0.25, 0.625), 3: (0.25, 0.5, 0.75)}
-"""Shares of the clip at which so many motions are half-way, at the earliest."""
+"""By the number of moves: the earliest time at which each is half-way, as a share of the clip."""
 
 SHORTEST_S, CLIP_S, LONGEST_S = 1.5, 3.5, 4.5
-"""Least, wanted and greatest length of the clip in seconds."""
+"""Shortest, usual and longest clip in seconds."""
 
 SLOW = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
-"""Times slower than real that are offered."""
+"""Slow motion to choose from: how many times slower than real."""
 
 LEGIBLE_S = 0.5
-"""Seconds of the clip that the longest flight takes at least, about, even if what rolls on does not stop in time."""
+"""Seconds of the clip that the longest flight should take, even if something still rolls at its end."""
 
 LEAD_S, HOLD_S = 0.1, 0.25
-"""Seconds of the clip before the first motion, at least, and after the last, so that it is seen to be over."""
+"""Seconds of the clip before the first move, at least, and after the last object has come to rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DefaultMotion:
-    """A motion of a scene's objects, and the clip that suits it. Made by ``default_motion``.
+    """How a scene's objects move, and the clip that shows it. Made by ``default_motion``.
 
-    moves: empty where nothing has room. frames, fps, slow: of a bake that shows all of it (``BakeOptions``).
-    action_s: seconds that it takes in the scene, about. sentence: what was chosen, for people.
+    moves: empty where nothing has room. frames, fps, slow: options of a bake that shows all of it (``BakeOptions``).
+    action_s: estimated seconds in the scene until all is at rest. sentence: what was chosen, in words.
 
     >>> import physgen
     >>> scene = physgen.load_scene("scene")  # doctest: +SKIP
@@ -94,12 +94,13 @@ def default_motion(
     calm: Collection[str] = (),
     still: Collection[str] = (),
 ) -> DefaultMotion:
-    """Return a motion for the objects of ``scene``, which are taken to be at rest: a hop each, as they have room.
+    """Return a motion for the objects of ``scene``, which are taken to be at rest: hops and pushes where there is room.
 
-    The peak follows from size, matter and the room above; the whole path stays in the picture and clear of other
-    objects, and ends on ground that looks like that where the object stands. fps: of the clip; frames, slow: its
-    length and how many times slower than real it is; None chooses them so that all of the action is shown, in some
-    three seconds. calm: names of objects that only hop straight up, low; still: of those that are left at rest.
+    How high an object hops depends on its size, its matter and the room above it. Its path stays in the picture and
+    clear of other objects, and ends on ground that looks like the ground where it stands. fps: of the clip. frames,
+    slow: its length, and how many times slower than real it is; None chooses them so that all of the motion is shown,
+    in about three seconds. calm: names of objects that only hop straight up, and low. still: of those that stay at
+    rest.
 
     >>> import physgen
     >>> physgen.default_motion(physgen.load_scene("scene")).sentence  # doctest: +SKIP
@@ -121,10 +122,10 @@ def fitted(
     frames: int | None = None,
     slow: float | None = None,
 ) -> DefaultMotion:
-    """Return the motion of ``scene`` by ``moves`` at times that fill a clip, and the clip, which ends when they do.
+    """Return ``moves`` of objects of ``scene`` at times that fill a clip, and that clip.
 
-    settles: for each of ``SLOW`` the seconds in the scene from the end of the last move until nothing is seen to move
-    any more, so slowly shown. fps, frames, slow: as of ``default_motion``.
+    settles: for each of ``SLOW``, the seconds in the scene from the end of the last move until nothing is seen to move
+    in a clip that is so slow. fps, frames, slow: as of ``default_motion``.
     """
     if not moves:
         given = frames or max(2, math.ceil(2.0 * fps))
@@ -173,8 +174,10 @@ def _apart(moves: Sequence[Move], slow: float) -> float:
 
 
 def _seconds(moves: Sequence[Move], middle: float, settle: float, slow: float) -> float:
-    """Return the length of a clip, until all has come to rest, in which the last of ``moves`` is half-way at ``middle``
-    s in the scene."""
+    """Return the length in seconds of a clip that ends when all is at rest.
+
+    middle: time at which the last of ``moves`` is half-way; settle: from its end until all is at rest; s in the scene.
+    """
     return slow * (middle + 0.5 * moves[-1].flight_s + settle) + HOLD_S
 
 
@@ -196,9 +199,9 @@ def _moves(scene: Scene, calm: Collection[str], still: Collection[str]) -> tuple
 
 
 def _next_move(stage: Stage, chosen: Sequence[Move], still: Collection[str]) -> Move | None:
-    """Return the best move of a thing that has not moved, else another one of the one that has rested longest.
+    """Return the best move of a thing that has not moved yet, else another move of the one that has rested longest.
 
-    What rolls goes on for long, so it comes last, and once: nothing else gets into its way.
+    Round things move last and only once: they roll on for long, and nothing else should get in their way.
     """
     moved = list(dict.fromkeys(move.name for move in chosen))
     fresh = [thing for thing in stage.things if thing.item.name not in (*moved, *still)]
@@ -255,8 +258,8 @@ MOTION_FIELDS = (
 
 
 def tells_motion(velocities: Sequence[Vector], spins: Sequence[Vector], overrides: Sequence[str]) -> bool:
-    """Return whether a request says itself how things move: velocities or spins (rest as well), or an override of what
-    moves an object or of gravity.
+    """Return whether a request says how things move: by velocities or spins, even of 0, or by an override of gravity or
+    of what moves an object.
     """
     fields = [text.partition("=")[0].rpartition(".")[2].strip() for text in overrides]
     return bool(velocities or spins) or any(name in MOTION_FIELDS for name in fields)

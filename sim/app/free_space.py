@@ -74,11 +74,15 @@ class Thing:
         """Return the thing turned in place by ``angle`` radians about the vertical ``up`` (3,) through its centre."""
 
         def turn(points: Array) -> Array:
-            local = points - self.centre
-            level = local - np.outer(local @ up, up)
-            return np.asarray(points + (math.cos(angle) - 1.0) * level + math.sin(angle) * np.cross(up, local))
+            return self.centre + rotated(points - self.centre, up, angle)
 
         return dataclasses.replace(self, hull=turn(self.hull), points=turn(self.points), base=turn(self.base))
+
+
+def rotated(points: Array, axis: Array, angle: float) -> Array:
+    """Return ``points`` (K, 3) turned by ``angle`` radians about the unit vector ``axis`` (3,) through the origin."""
+    across = points - np.outer(points @ axis, axis)
+    return np.asarray(points + (math.cos(angle) - 1.0) * across + math.sin(angle) * np.cross(axis, points))
 
 
 SILHOUETTE = 128

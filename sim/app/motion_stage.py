@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from ..scene.folder import Scene
 from ..scene.model import Ground, SceneObject
-from .free_space import Clearance, PlateColours, Thing, hidden_share, outside_frame, thing_at_rest, with_supports
+from .free_space import (
+    Clearance,
+    PlateColours,
+    Thing,
+    hidden_share,
+    outside_frame,
+    rotated,
+    thing_at_rest,
+    with_supports,
+)
 from .moves import Move, rounded, unit
 
 Array = NDArray[np.float64]
@@ -275,11 +284,8 @@ class Stage:
         local = thing.hull - thing.centre
         found = []
         for t in times:
-            angle = rate * t
-            turned = local * math.cos(angle) + np.cross(axis, local) * math.sin(angle)
-            turned = turned + np.outer(local @ axis, axis) * (1.0 - math.cos(angle))
             place = thing.centre + np.asarray(move.velocity) * t - 0.5 * self.gravity * t * t * self.up
-            found.append(turned + place)
+            found.append(place + rotated(local, axis, rate * t))
         return np.array(found)
 
     def _rating(

@@ -282,10 +282,7 @@ FLAGS: Mapping[str, frozenset[str]] = {
     "reconstruct": frozenset(("--out", "--box", "--name", "--size", "--horizon", "--pitch", "--fov")),
     "variant": frozenset(("--out", "--preset", "--velocity", "--spin", "--set", "--effects-json")),
     "bake": frozenset(
-        (
-            *("--out", "--frames", "--fps", "--quality", "--arch", "--seed", "--slow"),
-            *("--no-points", "--implicit", "--no-implicit"),
-        )
+        ("--out", "--frames", "--fps", "--quality", "--arch", "--seed", "--slow", "--no-points", "--no-implicit")
     ),
     "render": frozenset(("--out", "--bake", "--frames", *_RENDER_FLAGS)),
     "encode": frozenset(("--out", "--fps")),

@@ -174,9 +174,7 @@ class _Builder:
         argv = ["bake", f"{folder}/scene", "--out", out, "--frames", str(options.frames)]
         argv += ["--fps", number_text(options.fps), "--quality", options.quality, "--arch", options.arch]
         argv += ["--seed", str(seed), *([] if options.points else ["--no-points"])]
-        argv += (
-            [] if options.implicit == BakeOptions.implicit else ["--implicit" if options.implicit else "--no-implicit"]
-        )
+        argv += [] if options.implicit else ["--no-implicit"]
         argv += [] if options.slow == 1.0 else ["--slow", number_text(options.slow)]
         return self._task(
             f"{prefix}/bake",

@@ -40,7 +40,6 @@ from .layout import (
     FIELD_INTEGERS,
     FIRST_RIGID_BODY,
     FIRST_TOUCH,
-    FIXED_ONE,
     FULL,
     HAS_PLANE,
     PHASE,
@@ -58,6 +57,7 @@ from .layout import (
     Scalars,
     triple,
 )
+from .windows import in_cells
 
 LEAST_REACH, MOST_REACH = 0.1, 1.0
 """Cells between which a pair's reach is kept: surfaces are not known better, and nodes and particles see no farther."""
@@ -124,7 +124,7 @@ def sum_reached(
             level = plane.dot(first_node) - worlds.numbers[w * WORLD_ROW + PLANE_OFFSET]
             p = blocks.starts[k] + ss % SPREAD
             while p < blocks.starts[k + 1]:
-                here = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+                here = in_cells(particles.x[p])
                 fixed = particles.constants[p]
                 phi, obstacle = 1e9, 0
                 if worlds.numbers[w * WORLD_ROW + HAS_PLANE] > 0.5:

@@ -23,10 +23,10 @@ from .layout import (
     SPREAD,
     THICKNESS,
     WORLD,
-    ivec3,
     vec3,
     vec4,
 )
+from .sorting import node_beside
 from .surface_shares import LEAST_SLOPE, distance_from_middle, distance_of_share, slope_along
 
 LEAST_WALL = 0.99
@@ -41,6 +41,19 @@ MOST_SHARE = 0.6
 
 LEAST_SHARE = 0.0026
 """Share below which a body is too far from the node (1.25 cells) for a distance."""
+
+
+@func
+def left_by_others(whole: ti.f32, a: ti.i32, lead: ti.i32, i: ti.i32, overlap: OverlapBlocks, nodes: NodeArrays):
+    """What is left of ``whole`` at node ``i`` without the shares of all fields but that of block ``a``, of the blocks
+    that lie where ``lead`` does."""
+    left = whole
+    b = lead
+    while b >= 0:
+        if b != a:
+            left -= nodes.sums[overlap.slot[b] * BLOCK_NODES + i][3]
+        b = overlap.mate[b]
+    return left
 
 
 @func
@@ -102,14 +115,11 @@ def surer(b: ti.i32, i: ti.i32, sa: vec4, sb: vec4, overlap: OverlapBlocks):
         total = vec4(0.0)
         weight = 0.0
         for d in range(27):
-            node = ivec3(i // 16, i // 4 % 4, i % 4) + ivec3(d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1)
-            side = (node + 4) // 4
-            block = overlap.around[slot * 27 + side[0] * 9 + side[1] * 3 + side[2]]
+            block, n = node_beside(slot, i, d, overlap.around)
             if block >= 0:
                 other = overlap.slot[block]
                 if other >= 0:
                     if overlap.lead_fields[other] == overlap.lead_fields[slot]:
-                        n = (node[0] & 3) * 16 + (node[1] & 3) * 4 + (node[2] & 3)
                         seen = overlap.faces[other * BLOCK_NODES + n]
                         total += seen
                         weight += vec3(seen[0], seen[1], seen[2]).norm()

@@ -34,7 +34,7 @@ from .layout import (
     WORLD_ROW,
     triple,
 )
-from .sorting import block_key, neighbour_offset, slot_of
+from .sorting import block_key, slot_beside, slot_of
 
 HALF_SIDE = 3.0
 """Half the side in cells of the cube that a block's particles stay in before the next sort (window 0.5 to 6.5)."""
@@ -151,23 +151,6 @@ def find_mates(worlds: WorldArrays, grid: GridBlocks, table: BlockTable, overlap
 
 
 @func
-def link_overlap(s: ti.i32, grid: GridBlocks, table: BlockTable, overlap: OverlapBlocks):
-    """Find the blocks of the same field around the listed block ``s``."""
-    g = overlap.grid_blocks[s]
-    for d in range(27):
-        overlap.around[s * 27 + d] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(d)), table)
-
-
-@func
-def name_leads(n: ti.i32, grid: GridBlocks, overlap: OverlapBlocks):
-    """Note the first field for all listed blocks in the place of lead ``n``."""
-    b = overlap.leads[n]
-    while b >= 0:
-        overlap.lead_fields[overlap.slot[b]] = grid.field[overlap.leads[n]]
-        b = overlap.mate[b]
-
-
-@func
 def overlaps_around(k: ti.i32, blocks: ParticleBlocks, overlap: OverlapBlocks):
     """Whether a grid block around particle block ``k`` is listed in ``overlap``."""
     found = False
@@ -231,8 +214,16 @@ def list_overlap_blocks(
 
 @kernel
 def link_overlap_blocks(grid: GridBlocks, table: BlockTable, overlap: OverlapBlocks):
-    """Find what is around the listed grid blocks, and whose places they are in; ``table``: of the grid blocks."""
+    """Find the blocks of the same field around the listed grid blocks, and the first field in the place of each.
+
+    table: of the grid blocks.
+    """
     for s in range(overlap.grid_count):
-        link_overlap(s, grid, table, overlap)
+        g = overlap.grid_blocks[s]
+        for d in range(27):
+            overlap.around[s * 27 + d] = slot_beside(grid.field[g], grid.cells[g], d, table)
     for n in range(overlap.lead_count):
-        name_leads(n, grid, overlap)
+        b = overlap.leads[n]
+        while b >= 0:
+            overlap.lead_fields[overlap.slot[b]] = grid.field[overlap.leads[n]]
+            b = overlap.mate[b]

@@ -28,6 +28,7 @@ the nodes around (as cells beside empty ones are the surface in FLIP, Zhu and Br
 import taichi as ti
 
 from ..rigid.rigid_layout import DYNAMIC, KIND, KINDS, STATE, X
+from .body_faces import left_by_others
 from .collider_distance import PUSH, body_distance, single3
 from .kernel_arrays import (
     CouplingArrays,
@@ -68,6 +69,7 @@ from .layout import (
     vec3,
     vec4,
 )
+from .sorting import node_beside
 from .windows import add_to, grid_node, layer, weights
 
 STIFFNESS = 0.02
@@ -108,8 +110,8 @@ convex edge leaves as little as half of the room that there is: ln of that is so
 and lifted what floats."""
 
 AT_FACE = 0.5
-"""Largest crowding of a node beside ground and faces, which are told exactly. With no more than BESIDE there, what
-sloshes packs itself on the floor, 1.6 times as dense in the lowest half cell as its ln J says, for good."""
+"""Largest crowding of a node beside the ground and plane faces, where the room is known exactly. With only BESIDE,
+water that has sloshed stays packed on the floor: its lowest half cell is 1.6 times as dense as its ln J says."""
 
 BENT = 0.03
 """Cells by which a surface recedes ASIDE cells along its tangents, where it is no face any more: its room is then off
@@ -166,12 +168,7 @@ def leave_room(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, no
                 a = lead
                 while a >= 0:
                     for i in range(BLOCK_NODES):
-                        room = 1.0
-                        b = lead
-                        while b >= 0:
-                            if b != a:
-                                room -= nodes.sums[overlap.slot[b] * BLOCK_NODES + i][3]
-                            b = overlap.mate[b]
+                        room = left_by_others(1.0, a, lead, i, overlap, nodes)
                         flow.crowding[a * BLOCK_NODES + i] = ti.max(room, 0.0)
                     a = overlap.mate[a]
 
@@ -220,12 +217,10 @@ def inside(g: ti.i32, i: ti.i32, fill: ti.f32, grid: GridBlocks, flow: FlowArray
     """Share, 0 to 1, to which node ``i`` of grid block ``g`` lies inside of the fluid and not at its surface."""
     least = fill
     for d in range(27):
-        node = ivec3(i // 16, i // 4 % 4, i % 4) + ivec3(d // 9 - 1, d // 3 % 3 - 1, d % 3 - 1)
-        side = (node + 4) // 4
-        block = flow.around[g * 27 + side[0] * 9 + side[1] * 3 + side[2]]
+        block, n = node_beside(g, i, d, flow.around)
         other = ti.log(LEAST_FILL)
         if block >= 0:
-            other = flow.fill[block * BLOCK_NODES + (node[0] & 3) * 16 + (node[1] & 3) * 4 + (node[2] & 3)]
+            other = flow.fill[block * BLOCK_NODES + n]
         least = ti.min(least, other)
     return ti.min(ti.max((ti.exp(least - fill) - OUTER) / (INNER - OUTER), 0.0), 1.0)
 

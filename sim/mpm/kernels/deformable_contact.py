@@ -57,7 +57,6 @@ from .layout import (
     FIELDS,
     FIRST_FIELD,
     FIRST_PAIR,
-    FIXED_ONE,
     FULL,
     MODE,
     PHASE,
@@ -78,7 +77,17 @@ from .layout import (
     vec4,
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
-from .windows import add_to, clear_window, first_of, gathered, layer, store_window, sum_chosen_windows, weights
+from .windows import (
+    add_to,
+    clear_window,
+    first_of,
+    gathered,
+    in_cells,
+    layer,
+    store_window,
+    sum_chosen_windows,
+    weights,
+)
 
 SWEEPS = 8
 """Passes over the pairs of bodies at a node where three or more meet and some are thin."""
@@ -118,7 +127,7 @@ def scatter_shares(
                     if ti.static(laws.log_volume):
                         if is_one_of(law, LOG_VOLUMES):
                             volume *= ti.exp(particles.memory[p])
-                    gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+                    gp = in_cells(particles.x[p])
                     base = ti.cast(gp - 0.5, ti.i32)
                     fx = gp - ti.cast(base, ti.f32)
                     w3 = weights(fx)

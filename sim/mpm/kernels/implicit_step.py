@@ -64,7 +64,19 @@ from .layout import (
     vec3,
     vec4,
 )
-from .windows import add_to, clear_window, first_of, interpolate, load_window, spread, sum_windows, turns, weights
+from .windows import (
+    add_to,
+    clear_window,
+    columns,
+    first_of,
+    in_cells,
+    interpolate,
+    load_window,
+    spread,
+    sum_windows,
+    turns,
+    weights,
+)
 
 CONTACT_STIFFNESS = 4.0
 """Stiffness of the spring between a particle and a surface over (2 mu + lambda) V0, per cell²: of a particle's share
@@ -125,7 +137,7 @@ class ImplicitArrays(NamedTuple):
 @ti.func
 def place_of(x: ivec3):
     """Place in its window of a particle at ``x`` in fixed point, lowest node, place from there."""
-    here = ti.cast(x, ti.f32) * (1.0 / FIXED_ONE)
+    here = in_cells(x)
     base = ti.cast(here - 0.5, ti.i32)
     return here, base, here - ti.cast(base, ti.f32)
 
@@ -146,9 +158,7 @@ def value_and_gradient(first: ti.i32, fx: vec3, window: ti.template()):
 def spread_linear(first: ti.i32, fx: vec3, value: vec3, slopes: mat3, mass: ti.f32, window: ti.template()):
     """Add value + slopes (x_i - x_p), and ``mass`` as fourth number, to the nodes, times their weights."""
     b = value - slopes @ fx
-    c0 = vec4(slopes[0, 0], slopes[1, 0], slopes[2, 0], 0.0)
-    c1 = vec4(slopes[0, 1], slopes[1, 1], slopes[2, 1], 0.0)
-    c2 = vec4(slopes[0, 2], slopes[1, 2], slopes[2, 2], 0.0)
+    c0, c1, c2 = columns(slopes)
     spread(first, fx, vec4(b[0], b[1], b[2], mass), c0, c1, c2, window)
 
 

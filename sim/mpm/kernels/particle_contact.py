@@ -61,7 +61,6 @@ from .layout import (
     FIELD_INTEGERS,
     FIRST_RIGID_BODY,
     FIRST_TOUCH,
-    FIXED_ONE,
     FULL,
     HAS_ANCHORS,
     HAS_PLANE,
@@ -96,6 +95,7 @@ from .windows import (
     fetch_window,
     first_of,
     gathered,
+    in_cells,
     layer,
     load_window,
     node_of,
@@ -239,7 +239,7 @@ def solve_block(
         meet(lanes)
         p = blocks.starts[k] + lane
         while p < blocks.starts[k + 1]:
-            gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+            gp = in_cells(particles.x[p])
             fixed = particles.constants[p]
             past = particles.reaction[p]
             old = dt * vec3(past[0], past[1], past[2])

@@ -22,6 +22,7 @@ Only particles that lie DEEP in the share of other bodies look for partners: at 
 
 import taichi as ti
 
+from .body_faces import left_by_others
 from .kernel_arrays import (
     BlockTable,
     GridBlocks,
@@ -38,7 +39,6 @@ from .layout import (
     FIELD_INTEGERS,
     FIELDS,
     FIRST_FIELD,
-    FIXED_ONE,
     FULL,
     PAIRS,
     PHASE,
@@ -56,7 +56,7 @@ from .layout import (
 )
 from .particle_contact import parting_speed
 from .sorting import block_key, slot_of
-from .windows import grid_node, weights
+from .windows import grid_node, in_cells, weights
 
 NEARNESS = 0.85
 """Distance over the sum of the contact radii below which two particles push each other away. Above 0.71 nothing passes
@@ -87,12 +87,7 @@ def sum_others(worlds: WorldArrays, grid: GridBlocks, overlap: OverlapBlocks, no
                 a = lead
                 while a >= 0:
                     for i in range(BLOCK_NODES):
-                        others = 0.0
-                        b = lead
-                        while b >= 0:
-                            if b != a:
-                                others += nodes.sums[overlap.slot[b] * BLOCK_NODES + i][3]
-                            b = overlap.mate[b]
+                        others = -left_by_others(0.0, a, lead, i, overlap, nodes)
                         overlap.others[overlap.slot[a] * BLOCK_NODES + i] = others
                     a = overlap.mate[a]
 
@@ -185,7 +180,7 @@ def list_pairs(
                     if load_others(k, blocks, overlap, nodes) < deep:
                         p = blocks.starts[k + 1]
                 while p < blocks.starts[k + 1]:
-                    gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
+                    gp = in_cells(particles.x[p])
                     if others_at(lanes, k, gp, blocks, overlap, nodes) > deep:
                         list_partners(
                             p, k, ss // ti.static(lanes.span), w, gp, worlds, blocks, overlap, particles, table
@@ -220,7 +215,7 @@ def list_partners(
                     near = slot_of(block_key(other, blocks.cells[k] + side), table)
                     if near >= 0:
                         for q in range(blocks.starts[near], blocks.starts[near + 1]):
-                            apart = at - ti.cast(particles.x[q], ti.f32) * (1.0 / FIXED_ONE)
+                            apart = at - in_cells(particles.x[q])
                             if apart.norm_sqr() < FARTHEST * FARTHEST:
                                 if apart.norm() < least_distance(p, q, particles):
                                     n = ti.atomic_add(overlap.pair_counts[s], 1)
@@ -270,8 +265,8 @@ def part_pairs_of(
             row = (s * PAIRS + n) * 3
             p, near, q = overlap.pairs[row], overlap.pairs[row + 1], overlap.pairs[row + 2]
             side = ti.cast(4 * (blocks.cells[near] - blocks.cells[k]), ti.f32)
-            gp = ti.cast(particles.x[p], ti.f32) * (1.0 / FIXED_ONE)
-            gq = ti.cast(particles.x[q], ti.f32) * (1.0 / FIXED_ONE)
+            gp = in_cells(particles.x[p])
+            gq = in_cells(particles.x[q])
             apart = gp - side - gq
             distance = apart.norm()
             if distance > 1e-6:

@@ -64,8 +64,10 @@ from .layout import (
 )
 from .windows import (
     clear_window,
+    columns,
     fetch_window,
     first_of,
+    in_cells,
     interpolate,
     interpolate_curved,
     load_window,
@@ -127,21 +129,11 @@ def goal_step(
         if worlds.control[c + PHASE] == FULL:
             time += ti.cast(worlds.control[c + STEP], ti.f32)
         target, velocity = anchor_place(f, time, particles.anchors[p], worlds)
-        here = first_node + ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+        here = first_node + in_cells(xi)
         change = dt * (
             stiffness * (target - here) + worlds.field_numbers[f * FIELD_ROW + GOAL_DAMPING] * (velocity - v)
         )
     return change
-
-
-@ti.func
-def columns(matrix: mat3):
-    """The columns of ``matrix``, each with a fourth number 0."""
-    return (
-        vec4(matrix[0, 0], matrix[1, 0], matrix[2, 0], 0.0),
-        vec4(matrix[0, 1], matrix[1, 1], matrix[2, 1], 0.0),
-        vec4(matrix[0, 2], matrix[1, 2], matrix[2, 2], 0.0),
-    )
 
 
 @ti.func
@@ -245,7 +237,7 @@ def advance_block(
         if ti.static(len(laws.volumetric) > 0):
             packing = particles.memory[p]
         if gather:
-            gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            gp = in_cells(xi)
             base = ti.cast(gp - 0.5, ti.i32)
             fx = gp - ti.cast(base, ti.f32)
             first = spot + first_of(base, pads.window)
@@ -333,7 +325,7 @@ def advance_block(
             if ti.static(len(laws.volumetric) > 0):
                 slope = particles.slopes[p]
         if adheres:
-            here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            here = in_cells(xi)
             gap = ti.min(gap, level + normal.dot(here) - fixed[3])
         if scatter:
             own_V = V  # before any force
@@ -354,7 +346,7 @@ def advance_block(
             part = -4.0 * dt_scatter
             tau0, tau1, tau2 = columns(tau)
             c0, c1, c2 = part * tau0 + mass4 * K0, part * tau1 + mass4 * K1, part * tau2 + mass4 * K2
-            gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+            gp = in_cells(xi)
             base = ti.cast(gp - 0.5, ti.i32)
             fx = gp - ti.cast(base, ti.f32)
             first = offset + first_of(base, pads.scattered)

@@ -97,6 +97,24 @@ def neighbour_offset(d: ti.i32):
 
 
 @func
+def slot_beside(field: ti.i32, cell: ivec3, d: ti.i32, table: BlockTable):
+    """Slot of the block of ``field`` that is neighbour ``d`` of 27 of the one at ``cell``, -1 where there is none."""
+    return slot_of(block_key(field, cell + neighbour_offset(d)), table)
+
+
+@ti.func
+def node_beside(g: ti.i32, i: ti.i32, d: ti.i32, around: Integers):
+    """Neighbour ``d`` of 27 of node ``i`` of a block: the block that it lies in, and its number there.
+
+    around: 27 blocks around each block, -1 where there is none; g: which block is looked from.
+    """
+    node = ivec3(i // 16, i // 4 % 4, i % 4) + neighbour_offset(d)
+    side = (node + 4) // 4
+    block = around[g * 27 + side[0] * 9 + side[1] * 3 + side[2]]
+    return block, (node[0] & 3) * 16 + (node[1] & 3) * 4 + (node[2] & 3)
+
+
+@func
 def rebase_particle(p: ti.i32, k: ti.i32, moves: ti.i32, x: Cells, keys: Keys, blocks: ParticleBlocks):
     """Find the new block of particle ``p`` of block ``k`` and express its position in that block's window; where it
     does not move, ``keys`` gets the block that it has."""
@@ -210,10 +228,10 @@ def link_blocks(blocks: ParticleBlocks, grid: GridBlocks, p_table: BlockTable, g
     """Neighbour lists: 27 grid blocks around each particle block, 27 particle blocks around each grid block."""
     for t in range(blocks.count * 27):
         k = t // 27
-        blocks.neighbours[t] = slot_of(block_key(blocks.field[k], blocks.cells[k] + neighbour_offset(t % 27)), g_table)
+        blocks.neighbours[t] = slot_beside(blocks.field[k], blocks.cells[k], t % 27, g_table)
     for t in range(grid.count * 27):
         g = t // 27
-        grid.neighbours[t] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(t % 27)), p_table)
+        grid.neighbours[t] = slot_beside(grid.field[g], grid.cells[g], t % 27, p_table)
 
 
 @kernel
@@ -221,7 +239,7 @@ def link_grid_blocks(grid: GridBlocks, table: BlockTable, around: Integers):
     """The 27 grid blocks around each grid block, for fluids."""
     for t in range(grid.count * 27):
         g = t // 27
-        around[t] = slot_of(block_key(grid.field[g], grid.cells[g] + neighbour_offset(t % 27)), table)
+        around[t] = slot_beside(grid.field[g], grid.cells[g], t % 27, table)
 
 
 @kernel

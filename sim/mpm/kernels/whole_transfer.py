@@ -50,14 +50,16 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_transfer import KEPT, advance_block, columns, goal_step, scatter_past
+from .particle_transfer import KEPT, advance_block, goal_step, scatter_past
 from .windows import (
     LARGEST_WEIGHT,
     LEAST_LARGEST,
     MOST_SUM,
     clear_window,
+    columns,
     fetch_window,
     first_of,
+    in_cells,
     interpolate,
     interpolate_curved,
     largest_share,
@@ -193,7 +195,7 @@ def advance_block_in_whole_numbers(
             mass = fixed[0]
             Fp = particles.F[p]
             if gather:
-                gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                gp = in_cells(xi)
                 base = ti.cast(gp - 0.5, ti.i32)
                 fx = gp - ti.cast(base, ti.f32)
                 first = first_of(base, pads.window)
@@ -256,7 +258,7 @@ def advance_block_in_whole_numbers(
                 vp = particles.v[p]
                 Cp = particles.C[p]
             if adheres:
-                here = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                here = in_cells(xi)
                 gap = ti.min(gap, level + normal.dot(here) - fixed[3])
             if scatter:
                 own_v = vp  # before any force
@@ -270,7 +272,7 @@ def advance_block_in_whole_numbers(
                     tau, modulus = respond(laws, p, Fp, Cp, fixed, worlds, particles)
                 stiffness = ti.max(stiffness, modulus / mass)
                 Q = (-4.0 * dt_scatter) * tau + mass * Cp
-                gp = ti.cast(xi, ti.f32) * (1.0 / FIXED_ONE)
+                gp = in_cells(xi)
                 base = ti.cast(gp - 0.5, ti.i32)
                 fx = gp - ti.cast(base, ti.f32)
                 first = first_of(base, pads.scattered)

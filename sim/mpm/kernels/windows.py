@@ -15,7 +15,7 @@ from typing import Any
 import taichi as ti
 
 from .lanes import PADDED, PADDED_NODES
-from .layout import BLOCK_NODES, WINDOW, WINDOW_NODES, Integers, Vectors4, ivec3, mat3, vec3, vec4
+from .layout import BLOCK_NODES, FIXED_ONE, WINDOW, WINDOW_NODES, Integers, Vectors4, ivec3, mat3, vec3, vec4
 
 CURVED = 0.95
 """Share of the second derivatives of the velocity around a particle of a solid that it carries from substep to substep
@@ -55,6 +55,22 @@ def first_of(base: ti.template(), window: ti.template()):
         # Beyond shared memory lies an error of the whole card; elsewhere another block's window.
         node = ti.min(ti.max(node, 0), WINDOW - 3)
     return node[0] * ti.static(layer(window)) + node[1] * 8 + node[2]
+
+
+@ti.func
+def in_cells(x: ivec3):
+    """Place (cells) from a window's first node of what lies at ``x`` in fixed point."""
+    return ti.cast(x, ti.f32) * (1.0 / FIXED_ONE)
+
+
+@ti.func
+def columns(matrix: mat3):
+    """The columns of ``matrix``, each with a fourth number 0."""
+    return (
+        vec4(matrix[0, 0], matrix[1, 0], matrix[2, 0], 0.0),
+        vec4(matrix[0, 1], matrix[1, 1], matrix[2, 1], 0.0),
+        vec4(matrix[0, 2], matrix[1, 2], matrix[2, 2], 0.0),
+    )
 
 
 def is_given(argument: Any) -> bool:
