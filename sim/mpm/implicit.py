@@ -24,8 +24,9 @@ import taichi as ti
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .kernels import implicit_step
-from .kernels.implicit_step import FARTHEST, FASTEST, HIT, PRESSED, REPORT, ImplicitArrays
+from .kernels import implicit_contact, implicit_step
+from .kernels.implicit_contact import ImplicitArrays
+from .kernels.implicit_step import FARTHEST, FASTEST, HIT, PRESSED, REPORT
 from .kernels.kernel_arrays import (
     GridBlocks,
     NearBlocks,
@@ -265,7 +266,7 @@ class ImplicitSteps:
         momentum = self._arrays.found.to_numpy()[: matter.grid.count * BLOCK_NODES].astype(np.float64)
         nodes = Nodes(matter, momentum)
         self._host[:] = 0.0
-        implicit_step.find_surfaces.launch(
+        implicit_contact.find_surfaces.launch(
             dt,
             matter.worlds,
             matter.blocks,

@@ -7,6 +7,7 @@ import taichi as ti
 from physgen.benchmarks.gpu import CELL, mixed_world
 from physgen.sim.mpm import world_group
 from physgen.sim.mpm.kernels import runtime
+from physgen.sim.mpm.kernels.interpolation import LARGEST_WEIGHT, largest_share, spread_kept
 from physgen.sim.mpm.kernels.kernel_arrays import BlockTable, ParticleBlocks
 from physgen.sim.mpm.kernels.kernel_bundles import Launcher, kernel, merged
 from physgen.sim.mpm.kernels.lanes import ALONE, CUDA, SERIAL, lanes_of
@@ -24,7 +25,6 @@ from physgen.sim.mpm.kernels.layout import (
 )
 from physgen.sim.mpm.kernels.parallel_sorting import insert, place_in_turn
 from physgen.sim.mpm.kernels.sorting import BIAS, slot_of
-from physgen.sim.mpm.kernels.windows import LARGEST_WEIGHT, largest_share, spread_kept
 from physgen.sim.mpm.solver_options import SolverOptions
 
 

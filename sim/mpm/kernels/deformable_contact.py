@@ -35,6 +35,7 @@ import taichi as ti
 from .adhesion import counted, largest_pull, least_speed
 from .body_faces import facing, facing_thin, find_faces, meet_as_thin, surer
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
+from .interpolation import weights
 from .kernel_arrays import (
     AdhesionArrays,
     GridBlocks,
@@ -77,17 +78,7 @@ from .layout import (
     vec4,
 )
 from .particle_contact import HOLD, SPRING, coulomb, parting_speed
-from .windows import (
-    add_to,
-    clear_window,
-    first_of,
-    gathered,
-    in_cells,
-    layer,
-    store_window,
-    sum_chosen_windows,
-    weights,
-)
+from .windows import add_to, clear_window, first_of, gathered, in_cells, layer, store_window, sum_chosen_windows
 
 SWEEPS = 8
 """Passes over the pairs of bodies at a node where three or more meet and some are thin."""

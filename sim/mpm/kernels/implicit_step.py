@@ -20,71 +20,37 @@ Kernels of a CPU: a thread takes a block and its window, as in ``particle_transf
 """
 
 import functools
-from typing import NamedTuple
 
 import taichi as ti
 
 from ...constitutive import ROW
-from ..rigid.rigid_layout import STATE, V, W, X
-from .collider_distance import body_distance, single3
 from .constitutive_response import RELAXATION_TIME, RELAXING_SHARE, law_set, own_numbers, relaxed_branch
+from .implicit_contact import FREE, REACH, ImplicitArrays, contact_stiffness, pushed
+from .interpolation import columns, interpolate, spread, weights
 from .kernel_arrays import (
     GridBlocks,
-    NearBlocks,
     NodeArrays,
     ParticleArrays,
     ParticleBlocks,
-    RigidArrays,
-    ShapeArrays,
     WorldArrays,
 )
 from .kernel_bundles import BundledKernel, func, kernel
 from .lanes import SERIAL
 from .layout import (
     FIELD_INTEGERS,
-    FIRST_RIGID_BODY,
     FIRST_TOUCH,
     FIXED_HIGH,
     FIXED_LOW,
     FIXED_ONE,
-    HAS_PLANE,
-    PLANE_NORMAL,
-    PLANE_OFFSET,
-    RIGID_BODIES,
-    SLIDING,
     SPREAD,
-    STICKING,
     TOUCH_ROW,
     WINDOW_NODES,
-    Scalars,
-    Vectors4,
     ivec3,
     mat3,
-    triple,
     vec3,
     vec4,
 )
-from .windows import (
-    add_to,
-    clear_window,
-    columns,
-    first_of,
-    in_cells,
-    interpolate,
-    load_window,
-    spread,
-    sum_windows,
-    turns,
-    weights,
-)
-
-CONTACT_STIFFNESS = 4.0
-"""Stiffness of the spring between a particle and a surface over (2 mu + lambda) V0, per cell²: of a particle's share
-of the surface, a quarter of a cell², half a cell of the matter has this."""
-
-FREE = -1.0
-"""State of a particle that no surface pushes; of one that is pushed, the share of the spring along the surface that
-friction bears, 1 where it sticks."""
+from .windows import add_to, clear_window, first_of, in_cells, load_window, sum_windows, turns
 
 HIT, PRESSED, FASTEST, FARTHEST = range(4)
 """Numbers that a block reports: largest speed (cells/s) at which a particle that did not touch reaches a surface, or
@@ -93,53 +59,13 @@ displacement (cells) of a particle."""
 
 REPORT = 4
 
-CLOSE = 1e-4
-"""Cells from a surface within which a particle counts as touching it for the solver, which else would let what stands
-on it fall first."""
-
-CENTRING = 0.1
-"""Share of its gap by which a particle that a collider pushes is brought back to the surface in a step: where that is
-round, what slides along its tangent plane leaves it."""
-
-REACH = 2.0
-"""Cells from a surface within which particles may come to touch it."""
-
-YIELDING = 0.5
-"""Share of the secant stiffness of friction that slides which the solver counts with: with all of it, as iteratively
-reweighted least squares have it, no step overshoots, but they are slow; half is the least that is stable."""
-
-
-class ImplicitArrays(NamedTuple):
-    """Values at nodes and particles of an implicit step. G grid blocks, P particle blocks, N particles."""
-
-    given: Vectors4
-    """(G, BLOCK_NODES) what a kernel reads at the nodes."""
-
-    motion: Vectors4
-    """(G, BLOCK_NODES) velocities at the end of the step, cells/s."""
-
-    found: Vectors4
-    """(G, BLOCK_NODES) what a kernel sums up at the nodes."""
-
-    contact: Vectors4
-    """(N,) force of a surface on a particle at the end of the step (kg cells/s²), and the state of the contact."""
-
-    surface: Vectors4
-    """(N,) normal of the nearest surface, and how far it is from the particle at the beginning (cells)."""
-
-    carried: Vectors4
-    """(N,) displacement of that surface over the step (cells), and its row of contacts."""
-
-    report: Scalars
-    """(P, REPORT)"""
-
 
 @ti.func
 def place_of(x: ivec3):
-    """Place in its window of a particle at ``x`` in fixed point, lowest node, place from there."""
+    """Lowest node in its window of a particle at ``x`` in fixed point, and its place from there."""
     here = in_cells(x)
     base = ti.cast(here - 0.5, ti.i32)
-    return here, base, here - ti.cast(base, ti.f32)
+    return base, here - ti.cast(base, ti.f32)
 
 
 @ti.func
@@ -181,102 +107,11 @@ def gather_momentum(
             offset = k * WINDOW_NODES
             clear_window(SERIAL, 0, offset, nodes.scattered)
             for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                _, base, fx = place_of(particles.x[p])
+                base, fx = place_of(particles.x[p])
                 m = particles.constants[p][0]
                 first = offset + first_of(base, nodes.scattered)
                 spread_linear(first, fx, m * particles.v[p], m * particles.C[p], m, nodes.scattered)
     sum_nodes(grid, nodes, arrays)
-
-
-@func
-def ground_of(k: ti.i32, worlds: WorldArrays, blocks: ParticleBlocks):
-    """Normal of the ground, and its distance (cells) from the origin of block ``k``'s window; far if there is none."""
-    normal = triple(worlds.numbers, PLANE_NORMAL)
-    level = normal.dot(ti.cast(blocks.cells[k] * 4 - 1, ti.f32)) - worlds.numbers[PLANE_OFFSET]
-    if worlds.numbers[HAS_PLANE] < 0.5:
-        level = 1e9
-    return normal, level
-
-
-@kernel
-def find_surfaces(
-    dt: ti.f32,
-    worlds: WorldArrays,
-    blocks: ParticleBlocks,
-    near: NearBlocks,
-    particles: ParticleArrays,
-    bodies: RigidArrays,
-    shapes: ShapeArrays,
-    arrays: ImplicitArrays,
-):
-    """The surface nearest to each particle, ``surface``, and its displacement over ``dt``, ``carried``."""
-    for kk in range(blocks.count * SPREAD):
-        if kk % SPREAD == 0:
-            k = kk // SPREAD
-            plane, level = ground_of(k, worlds, blocks)
-            first_touch = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH]
-            first_node = ti.cast(blocks.cells[k] * 4 - 1, ti.f32)
-            first = worlds.integers[FIRST_RIGID_BODY]
-            colliders = ti.select(near.slot[k] >= 0, worlds.integers[RIGID_BODIES], 0)
-            for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                here, _, _ = place_of(particles.x[p])
-                radius = particles.constants[p][3]
-                gap, normal, moved, row = level + plane.dot(here) - radius, plane, vec3(0.0), first_touch * TOUCH_ROW
-                for o in range(colliders):
-                    distance, along, _ = body_distance(first + o, first_node + here, REACH + radius, bodies, shapes)
-                    if distance - radius < gap:
-                        start = (first + o) * STATE
-                        arm = first_node + here - single3(bodies.state, start + X)
-                        moved = dt * (single3(bodies.state, start + V) + single3(bodies.state, start + W).cross(arm))
-                        gap, normal, row = distance - radius, along, (first_touch + o + 1) * TOUCH_ROW
-                arrays.surface[p] = vec4(normal[0], normal[1], normal[2], gap)
-                arrays.carried[p] = vec4(moved[0], moved[1], moved[2], ti.cast(row, ti.f32))
-
-
-@func
-def contact_stiffness(p: ti.i32, particles: ParticleArrays):
-    """Of the spring between particle ``p`` and a surface, kg/s²."""
-    return CONTACT_STIFFNESS * (particles.constants[p][1] + particles.constants[p][2])
-
-
-@func
-def pushed(
-    p: ti.i32,
-    touch: ti.i32,
-    is_ground: ti.i32,
-    gap: ti.f32,
-    normal: vec3,
-    shift: vec3,
-    worlds: WorldArrays,
-    particles: ParticleArrays,
-):
-    """Force of a surface (kg cells/s²) on particle ``p``, ``gap`` cells away before the particle moves by ``shift``
-    against it, and the state of the contact."""
-    past = particles.reaction[p]
-    before = particles.constants[p][0] * vec3(past[0], past[1], past[2])
-    stiffness = contact_stiffness(p, particles)
-    along = shift.dot(normal)
-    pressed = before.dot(normal)
-    # A contact goes on from where it is; a new one begins at the surface.
-    moved = along
-    if pressed <= 0.0:
-        moved += ti.max(gap, 0.0)
-    elif not is_ground:
-        moved += CENTRING * gap
-    trial = pressed - stiffness * moved
-    pressing = ti.max(0.0, trial)
-    force = pressing * normal
-    state = FREE
-    if trial > -CLOSE * stiffness:
-        state = 1.0
-        rubbing = before - pressed * normal - stiffness * (shift - along * normal)
-        size = rubbing.norm()
-        if size > 0.0 and size > worlds.contacts[touch + STICKING] * pressing:
-            share = worlds.contacts[touch + SLIDING] * pressing / size
-            rubbing *= share
-            state = YIELDING * share
-        force += rubbing
-    return force, state
 
 
 @functools.cache
@@ -307,7 +142,7 @@ def find_forces_of(laws: int) -> BundledKernel:
                     ground = worlds.field_integers[blocks.field[k] * FIELD_INTEGERS + FIRST_TOUCH] * TOUCH_ROW
                     hit, sum_pressed = 0.0, 0.0
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                        _, base, fx = place_of(particles.x[p])
+                        base, fx = place_of(particles.x[p])
                         window_node = first_of(base, nodes.window)
                         shift, H = value_and_gradient(spot + window_node, fx, nodes.window)
                         for r in ti.static(range(3)):
@@ -399,7 +234,7 @@ def multiply_stiffness_of(laws: int) -> BundledKernel:
                     offset = k * WINDOW_NODES
                     clear_window(SERIAL, 0, offset, nodes.scattered)
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                        _, base, fx = place_of(particles.x[p])
+                        base, fx = place_of(particles.x[p])
                         window_node = first_of(base, nodes.window)
                         shift, G = value_and_gradient(spot + window_node, fx, nodes.window)
                         two_mu, lam = moduli(models, p, dt, worlds, particles)
@@ -443,7 +278,7 @@ def find_diagonal_of(laws: int) -> BundledKernel:
                 offset = k * WINDOW_NODES
                 clear_window(SERIAL, 0, offset, nodes.scattered)
                 for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                    _, base, fx = place_of(particles.x[p])
+                    base, fx = place_of(particles.x[p])
                     two_mu, lam = moduli(models, p, dt, worlds, particles)
                     spring = vec3(0.0)
                     state = arrays.contact[p][3]
@@ -497,7 +332,7 @@ def move_particles_of(laws: int) -> BundledKernel:
                     speed2, farthest = 0.0, 0.0
                     load_window(k, spot, blocks.neighbours, nodes.window, arrays.motion)
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
-                        _, base, fx = place_of(particles.x[p])
+                        base, fx = place_of(particles.x[p])
                         v, C = value_and_gradient(spot + first_of(base, nodes.window), fx, nodes.window)
                         particles.v[p] = v
                         particles.C[p] = C
@@ -505,7 +340,7 @@ def move_particles_of(laws: int) -> BundledKernel:
                     load_window(k, spot, blocks.neighbours, nodes.window, arrays.given)
                     for p in range(blocks.starts[k], blocks.starts[k + 1]):
                         x = particles.x[p]
-                        _, base, fx = place_of(x)
+                        base, fx = place_of(x)
                         shift, H = value_and_gradient(spot + first_of(base, nodes.window), fx, nodes.window)
                         for r in ti.static(range(3)):
                             H[r, r] += 1.0

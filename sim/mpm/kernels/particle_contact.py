@@ -38,6 +38,7 @@ from .collider_distance import (
     single3,
     surface_slide,
 )
+from .interpolation import weights
 from .kernel_arrays import (
     AdhesionArrays,
     CouplingArrays,
@@ -102,7 +103,6 @@ from .windows import (
     store_window,
     sum_chosen_windows,
     turns,
-    weights,
 )
 
 RECOVERY = 0.2

@@ -23,6 +23,7 @@ Only particles that lie DEEP in the share of other bodies look for partners: at 
 import taichi as ti
 
 from .body_faces import left_by_others
+from .interpolation import weights
 from .kernel_arrays import (
     BlockTable,
     GridBlocks,
@@ -56,7 +57,7 @@ from .layout import (
 )
 from .particle_contact import parting_speed
 from .sorting import block_key, slot_of
-from .windows import grid_node, in_cells, weights
+from .windows import grid_node, in_cells
 
 NEARNESS = 0.85
 """Distance over the sum of the contact radii below which two particles push each other away. Above 0.71 nothing passes

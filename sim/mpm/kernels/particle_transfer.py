@@ -19,6 +19,7 @@ import taichi as ti
 from .constitutive_response import deform, is_fluid, law_of, respond
 from .constitutive_response import flows as material_flows
 from .crowding import STIFFNESS, load_crowding, part_crowd, relaxed
+from .interpolation import columns, interpolate, interpolate_curved, spread, spread_kept
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
 from .lanes import lane_maxima, lane_sum, meet
@@ -62,19 +63,7 @@ from .layout import (
     vec3,
     vec4,
 )
-from .windows import (
-    clear_window,
-    columns,
-    fetch_window,
-    first_of,
-    in_cells,
-    interpolate,
-    interpolate_curved,
-    load_window,
-    spread,
-    spread_kept,
-    store_window,
-)
+from .windows import clear_window, fetch_window, first_of, in_cells, load_window, store_window
 
 PIN, GOAL = 1.0, 2.0
 """Types of anchors."""

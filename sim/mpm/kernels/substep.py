@@ -24,8 +24,9 @@ from ..rigid.rigid_motion import predict, rigid_substep
 from .adhesion import sum_reached
 from .collider_distance import gather_pushes, gather_pushes_in_parallel
 from .constitutive_response import law_set
-from .crowding import add_pushes, find_crowding, leave_room, measure_fill, push_fields
+from .crowding import add_pushes, find_crowding, push_fields
 from .deformable_contact import gather_shares, scatter_shares, separate
+from .fluid_room import leave_room, measure_fill
 from .grid import advance_nodes, advance_nodes_in_parallel, gather_means
 from .kernel_arrays import (
     AdhesionArrays,

@@ -5,15 +5,16 @@
 """The pass over the particles of a substep, and its form for a card's shared memory, which adds whole numbers.
 
 A block counts momentum and mass at nodes in units such that all its particles together cannot exceed MOST_SUM at any: a
-particle's largest share is found before it is added (``windows.largest_share``). Where more particles than lanes are in
-a block, and later ones have larger shares, what has been added is counted anew in larger units. This is a function of
-its own because the CPU's bytes depend on the order of ``advance_block``'s statements.
+particle's largest share is found before it is added (``interpolation.largest_share``). Where more particles than lanes
+are in a block, and later ones have larger shares, what has been added is counted anew in larger units. This is a
+function of its own because the CPU's bytes depend on the order of ``advance_block``'s statements.
 """
 
 import taichi as ti
 
 from .constitutive_response import deform, law_of, respond
 from .constitutive_response import flows as material_flows
+from .interpolation import LARGEST_WEIGHT, columns, interpolate, interpolate_curved, largest_share, spread, spread_kept
 from .kernel_arrays import FlowArrays, NearBlocks, NodeArrays, ParticleArrays, ParticleBlocks, WorldArrays
 from .kernel_bundles import func
 from .lanes import lane_maxima, lane_sum, meet, pads_of
@@ -52,20 +53,13 @@ from .layout import (
 )
 from .particle_transfer import KEPT, advance_block, goal_step, scatter_past
 from .windows import (
-    LARGEST_WEIGHT,
     LEAST_LARGEST,
     MOST_SUM,
     clear_window,
-    columns,
     fetch_window,
     first_of,
     in_cells,
-    interpolate,
-    interpolate_curved,
-    largest_share,
     scale_window,
-    spread,
-    spread_kept,
     store_window,
     turns,
 )
