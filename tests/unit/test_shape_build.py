@@ -270,3 +270,12 @@ def test_a_can_whose_mask_lacks_a_corner_does_not_cross_itself():
     checked(body)
     assert body.fit > 0.98
     assert check_surface(Surface(vertices=body.mesh.vertices, faces=body.mesh.faces), name="can") == ()
+
+
+def test_a_can_up_to_the_horizon_stays_as_deep_as_wide_where_its_mask_lacks_a_rim():
+    mask = outline(SurfaceOfRevolution(-0.1, 2.0, (0.0, 1.04), (0.25, 0.25)), 17.0)
+    rows, columns = np.nonzero(mask)
+    mask[: rows.min() + 9, : (columns.min() + columns.max()) // 2] = False
+    body = made(mask, pitch_deg=17.0, vertices=1500, shape="cylinder")
+    wide, deep, _ = np.ptp(body.mesh.vertices, axis=0)
+    assert deep == pytest.approx(wide, rel=0.05)

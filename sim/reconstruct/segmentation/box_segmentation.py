@@ -32,6 +32,7 @@ from .mask_proposals import (
     score,
     without_notches,
 )
+from .mirrored_outline import mirrored_outline
 from .outer_rim import outer_rim
 from .plain_backdrop import missing_parts, plain_backdrop
 from .strokes import Strokes, no_strokes
@@ -189,6 +190,9 @@ def segment(
         gaps, rods = _details(crop, inner, found, taken, keep, drop)
         found = (found & ~gaps) | rods
         found = settle_outline(crop, drop_ground_shadow(crop, _kept_part(found & ~taken, taken, keep)))
+        mirrored = mirrored_outline(crop, inner, found, taken, drop)
+        if (mirrored != found).any():
+            found = settle_outline(crop, mirrored)
         rim = outer_rim(crop, found, taken | drop)
         if rim.any():
             found = settle_outline(crop, found | rim)

@@ -46,6 +46,8 @@ SQUEEZED, UNFOLDED_RIM = 0.2, 3.0
 """Area that a warp leaves of a pixel at least, and how far outside of the primitive, in pixels, that holds."""
 UNFOLDING, UNFOLDING_ROUNDS = (1.5, 10.0), 16
 """Standard deviations of the smoothing where a warp folds, in pixels, from the first to the last of so many rounds."""
+FARTHEST_SLID = 0.25
+"""Largest share of its depth by which a point at the base follows the ground where the warp moves it; less above."""
 SMALLEST_PART = 0.002
 """Least area of a part over the object's."""
 
@@ -228,6 +230,8 @@ def bent_mesh(camera: Camera, crop: Crop, primitive: Primitive, fitted: OutlineW
     low = np.clip(1.0 - vertices[:, 2] / primitive.height, 0.0, 1.0)
     with np.errstate(invalid="ignore"):
         slid = np.where(np.isfinite(after) & np.isfinite(before), after / before, 1.0)
+    # Towards the horizon the ground runs away: what is high above it must not follow.
+    slid = np.clip(slid, 1.0 - FARTHEST_SLID * low, 1.0 + FARTHEST_SLID * low)
     depth = depth * (1.0 + low * (slid - 1.0))
     on_ground = vertices[:, 2] <= 1e-9 * primitive.height
     depth = np.where(on_ground, after, np.minimum(depth, after))
