@@ -230,12 +230,15 @@ def _rehearse(
 ) -> DefaultMotion:
     """Return ``motion`` with the speed and the clip that coarse bakes in ``folder`` suggest.
 
-    What falls over in one only hops straight up in the next, and stays where it is if it falls over even so.
+    What falls over in one only hops straight up in the next, and stays where it is if it falls over even so. What
+    turns sides to the camera that the photo does not show neither turns nor leans in the next, then hops straight up.
+    What does either in a later move of its own is spared that one.
     """
     from ..sim.app.clip_check import MOST_REHEARSALS, rehearsal_options, rehearsed
     from ..sim.app.default_motion import default_motion
 
     calm: set[str] = set()
+    plain: set[str] = set()
     still: set[str] = set()
     for number in range(MOST_REHEARSALS):
         out = folder / str(number)
@@ -246,11 +249,20 @@ def _rehearse(
             on_event({"event": "notice", "stage": "motion", "message": message})
             return motion
         found = rehearsed(scene, load_bake(out), motion, frames=frames, slow=slow)
-        fallen = {move.name for move in motion.moves} & set(found.toppled)
-        if fallen:
+        moved = {move.name for move in motion.moves}
+        fallen = moved & set(found.toppled)
+        # A hop straight up is the least there is.
+        turned = (moved & set(found.turned)) - calm
+        shorter = found.shortened(scene)
+        if shorter is not None and number < MOST_REHEARSALS - 1:
+            motion = shorter
+        elif fallen or turned:
             still |= fallen & calm
-            calm |= fallen
-            motion = default_motion(scene, fps=options.fps, frames=frames, slow=slow, calm=calm, still=still)
+            calm |= fallen | (turned & plain)
+            plain |= turned
+            motion = default_motion(
+                scene, fps=options.fps, frames=frames, slow=slow, calm=calm, plain=plain, still=still
+            )
             if not motion.moves:
                 return motion
         elif not found.leaving or number == MOST_REHEARSALS - 1:

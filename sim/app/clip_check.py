@@ -7,9 +7,10 @@ it tells what leaves the picture, what falls over, and when the action ends.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,11 +21,13 @@ from ..cache.pc2 import Pc2Reader
 from ..rigid_alignment import nearest_rotation
 from ..scene.bake_quality import COARSEST
 from ..scene.folder import Scene
+from ..scene.meshes import load_object_mesh
 from ..scene.model import Camera
 from ..scene.scene_object import SceneObject
 from .bake_options import BakeOptions
 from .default_motion import LONGEST_S, SLOW, DefaultMotion, fitted
-from .free_space import thing_at_rest
+from .free_space import Surface, thing_at_rest
+from .moves import Move
 
 Array = NDArray[np.floating]
 
@@ -165,18 +168,42 @@ TAMED = 0.75
 TOPPLED = math.radians(40.0)
 """Turn from rest at which a thing that does not roll counts as fallen over: it shows sides that the photo does not."""
 
+GUESSED = 0.15
+"""Share of a thing's picture, of sides that the photo does not show, above which it has turned too far in a rehearsal.
+"""
+
 MOST_REHEARSALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rehearsed:
     """motion: with the clip that ends when nothing is seen to move any more. leaving: the warning about each object
-    that leaves the picture within that clip. toppled: names of the objects that fall over in it.
+    that leaves the picture within that clip. toppled: names of the objects that fall over in it; turned: of those that
+    stay upright and yet show much of sides that the photo does not. good: for each of both how many of its moves had
+    come to an end before that. frames, slow: as asked for, None where they are chosen.
     """
 
     motion: DefaultMotion
     leaving: tuple[str, ...]
     toppled: tuple[str, ...] = ()
+    turned: tuple[str, ...] = ()
+    good: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    frames: int | None = None
+    slow: float | None = None
+
+    def shortened(self, scene: Scene) -> DefaultMotion | None:
+        """Return the motion less the moves in which things fall over or turn too far, where these had moved well
+        before, and what these do later; None where none had."""
+        motion = self.motion
+        kept: list[Move] = []
+        for move in motion.moves:
+            good = self.good.get(move.name, 0)
+            if good == 0 or sum(other.name == move.name for other in kept) < good:
+                kept.append(move)
+        if len(kept) == len(motion.moves):
+            return None
+        settles = dict.fromkeys(SLOW, kept[-1].settle_s)
+        return fitted(scene, tuple(kept), settles, fps=motion.fps, frames=self.frames, slow=self.slow)
 
     def tamed(self, scene: Scene) -> DefaultMotion:
         """Return the motion with less speed, of which a rehearsal is to be made again."""
@@ -230,12 +257,27 @@ def rehearsed(
     names = [item.name for item in bake.manifest.objects]
     seen = Clip(first=1, fps=rate)
     gone = [leaving(name, track[:shown], camera, seen, end=1.0) for name, track in zip(names, tracks, strict=True)]
-    lying = [
-        item.name
-        for item, cache in zip(scene.model.objects, caches, strict=True)
-        if not _rolls(scene, item) and _turn(cache, shown) > TOPPLED
-    ]
-    return Rehearsed(motion=clip, leaving=tuple(text for text in gone if text), toppled=tuple(lying))
+    lying: list[str] = []
+    turned: list[str] = []
+    good: dict[str, int] = {}
+    for item, cache in zip(scene.model.objects, caches, strict=True):
+        if _rolls(scene, item):
+            continue
+        lies, shows = _turns(cache, shown) > TOPPLED, _guessed(scene, item, cache, shown) > GUESSED
+        if lies.any() or shows.any():
+            (lying if lies.any() else turned).append(item.name)
+            first = float(np.argmax(lies | shows)) / rate
+            begun = sum(move.name == item.name and move.start_s < first for move in motion.moves)
+            good[item.name] = max(0, begun - 1)
+    return Rehearsed(
+        motion=clip,
+        leaving=tuple(text for text in gone if text),
+        toppled=tuple(lying),
+        turned=tuple(turned),
+        good=good,
+        frames=frames,
+        slow=slow,
+    )
 
 
 def _rolls(scene: Scene, item: SceneObject) -> bool:
@@ -243,14 +285,23 @@ def _rolls(scene: Scene, item: SceneObject) -> bool:
     return item.material.law in ("sand", "snow", "fluid") or thing_at_rest(scene, item, scene.model.ground_plane).round
 
 
-def _turn(cache: Pc2Reader, count: int) -> float:
-    """Largest angle in radians, among the first ``count`` samples of ``cache``, of the rotation that fits best from the
-    first one."""
+def _turns(cache: Pc2Reader, count: int) -> NDArray[np.float64]:
+    """Angles in radians, of the first ``count`` samples of ``cache``, of the rotation that fits best from the first
+    one."""
     rest = cache.sample(0).astype(np.float64)
     rest -= rest.mean(axis=0)
-    most = 0.0
+    angles = np.zeros(count)
     for number in range(1, count):
         now = cache.sample(number).astype(np.float64)
         turn = nearest_rotation((now - now.mean(axis=0)).T @ rest)
-        most = max(most, math.acos(float(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
-    return most
+        angles[number] = math.acos(float(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    return angles
+
+
+def _guessed(scene: Scene, item: SceneObject, cache: Pc2Reader, count: int) -> NDArray[np.float64]:
+    """Shares of the picture of ``item``, in the first ``count`` samples of ``cache``, that the photo does not show
+    (``Surface.guessed``)."""
+    faces = load_object_mesh(scene, item).faces
+    eye = np.asarray(scene.model.camera.world_from_camera, dtype=np.float64)[:3, 3]
+    surfaces = [Surface.of(cache.sample(number).astype(np.float64), faces) for number in range(count)]
+    return np.array([surfaces[0].guessed(now, eye) for now in surfaces])

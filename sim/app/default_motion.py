@@ -92,6 +92,7 @@ def default_motion(
     frames: int | None = None,
     slow: float | None = None,
     calm: Collection[str] = (),
+    plain: Collection[str] = (),
     still: Collection[str] = (),
 ) -> DefaultMotion:
     """Return a motion for the objects of ``scene``, which are taken to be at rest: hops and pushes where there is room.
@@ -99,8 +100,8 @@ def default_motion(
     How high an object hops depends on its size, its matter and the room above it. Its path stays in the picture and
     clear of other objects, and ends on ground that looks like the ground where it stands. fps: of the clip. frames,
     slow: its length, and how many times slower than real it is; None chooses them so that all of the motion is shown,
-    in about three seconds. calm: names of objects that only hop straight up, and low. still: of those that stay at
-    rest.
+    in about three seconds. calm: names of objects that only hop straight up, and low. plain: of those that
+    neither turn nor lean. still: of those that stay at rest.
 
     >>> import physgen
     >>> physgen.default_motion(physgen.load_scene("scene")).sentence  # doctest: +SKIP
@@ -108,7 +109,7 @@ def default_motion(
 
     Raises InputError for a mesh or clean plate that cannot be read.
     """
-    moves = _moves(scene, calm, still)
+    moves = _moves(scene, calm, plain, still)
     settle = moves[-1].settle_s if moves else 0.0
     return fitted(scene, moves, dict.fromkeys(SLOW, settle), fps=fps, frames=frames, slow=slow)
 
@@ -149,7 +150,7 @@ def fitted(
     apart = _apart(moves, slow)
     # What takes long to come to rest, as what rolls, would leave the others to the beginning of the clip.
     whole = min(seconds, most) / slow
-    middles = [max(MIDDLES[len(moves)][0] * whole, apart)]
+    middles = [max(MIDDLES[len(moves)][0] * whole, 0.5 * moves[0].flight_s + LEAD_S / slow)]
     for middle in MIDDLES[len(moves)][1:]:
         middles.append(max(middle * whole, middles[-1] + apart))
     if frames is None:
@@ -168,7 +169,7 @@ def _apart(moves: Sequence[Move], slow: float) -> float:
     """Return the least seconds in the scene from the middle of one move to that of the next, and before the first."""
     least = 0.5 * moves[0].flight_s + LEAD_S / slow
     for before, after in itertools.pairwise(moves):
-        rest = 0.5 * before.settle_s if before.name == after.name else 0.0
+        rest = before.pause_s if before.name == after.name else 0.0
         least = max(least, 0.5 * before.flight_s + rest + 0.5 * after.flight_s)
     return least
 
@@ -181,13 +182,13 @@ def _seconds(moves: Sequence[Move], middle: float, settle: float, slow: float) -
     return slow * (middle + 0.5 * moves[-1].flight_s + settle) + HOLD_S
 
 
-def _moves(scene: Scene, calm: Collection[str], still: Collection[str]) -> tuple[Move, ...]:
+def _moves(scene: Scene, calm: Collection[str], plain: Collection[str], still: Collection[str]) -> tuple[Move, ...]:
     model = scene.model
     gravity = float(np.linalg.norm(model.gravity))
     # A hop comes down where gravity points into the ground; elsewhere nothing simple is right.
     if model.ground is None or gravity < 0.5 or float(np.dot(model.gravity, model.ground.unit_normal)) > -0.9 * gravity:
         return ()
-    stage = Stage(scene, gravity, calm)
+    stage = Stage(scene, gravity, calm, plain)
     chosen: list[Move] = []
     while len(chosen) < MOST_MOVES:
         move = _next_move(stage, chosen, still)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A scene at rest, as a default motion sees it: its things, their supports, how near they are, and the frame."""
+"""A scene at rest, as a default motion sees it: its things, their supports and sides, how near they are, the frame."""
 
 from __future__ import annotations
 
@@ -24,18 +24,56 @@ ROUND = 0.85
 """Sphericity 36 π V² / A³ of the hull above which a thing rolls: 1 for a ball, 0.67 for a tin, 0.52 for a cube."""
 
 
+EDGE_ON = math.cos(math.radians(80.0))
+"""Cosine to the camera below which a photo tells little of a surface: a pixel there covers six times its length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Pieces of a body's surface: centres (N, 3) m, and areas (N, 3) m², their normals as long as they are large."""
+
+    centres: Array
+    areas: Array
+
+    @classmethod
+    def of(cls, vertices: Array, faces: NDArray[np.int64]) -> Surface:
+        """Return that of a mesh: vertices (V, 3), faces (T, 3) counter-clockwise from outside; about FINE_POINTS."""
+        corners = vertices[faces[:: max(1, len(faces) // FINE_POINTS)]]
+        edges = corners[:, 1:] - corners[:, :1]
+        return cls(corners.mean(axis=1), 0.5 * np.cross(edges[:, 0], edges[:, 1]))
+
+    def faces(self, eye: Array) -> tuple[Array, Array]:
+        """Return for each piece how large (N,) it looks from ``eye`` (3,), in sr, and the cosine (N,) to it."""
+        ways = eye - self.centres
+        far = np.linalg.norm(ways, axis=1)
+        facing = np.einsum("ij,ij->i", self.areas, ways)
+        cosines = facing / np.maximum(far * np.linalg.norm(self.areas, axis=1), 1e-30)
+        return np.maximum(facing, 0.0) / far**3, cosines
+
+    def guessed(self, now: Surface, eye: Array) -> float:
+        """Return the share, 0 to 1, of what ``eye`` (3,) sees of the body as it is ``now`` that it saw from behind or
+        edge on when the body was like this, beyond such a share then. What a body hides of itself counts as seen.
+        """
+        looked, cosines = self.faces(eye)
+        looks = now.faces(eye)[0]
+        unknown = cosines < EDGE_ON
+        shares = [float(each[unknown].sum() / max(float(each.sum()), 1e-30)) for each in (looks, looked)]
+        return max(0.0, shares[0] - shares[1])
+
+
 @dataclass(frozen=True, eq=False)
 class Thing:
     """An object as it rests.
 
     hull: (K, 3) corners of its convex hull, with points of its surface in between; points: (N, 3) of its surface;
-    centre: (3,); base: (B, 3) what it stands on; heights: of lowest and highest point over the ground; round: whether
-    it rolls; carried: whether it stands on another object; free: whether it may be moved.
+    surface: which way it faces; centre: (3,); base: (B, 3) what it stands on; heights: of lowest and highest point over
+    the ground; round: whether it rolls; carried: whether it stands on another object; free: whether it may be moved.
     """
 
     item: SceneObject
     hull: Array
     points: Array
+    surface: Surface
     centre: Array
     base: Array
     heights: tuple[float, float]
@@ -67,7 +105,12 @@ class Thing:
     def shifted(self, way: Array) -> Thing:
         """Return the thing moved along the ground by ``way`` (3,) m."""
         return dataclasses.replace(
-            self, hull=self.hull + way, points=self.points + way, centre=self.centre + way, base=self.base + way
+            self,
+            hull=self.hull + way,
+            points=self.points + way,
+            surface=Surface(self.surface.centres + way, self.surface.areas),
+            centre=self.centre + way,
+            base=self.base + way,
         )
 
     def turned(self, angle: float, up: Array) -> Thing:
@@ -76,7 +119,13 @@ class Thing:
         def turn(points: Array) -> Array:
             return self.centre + rotated(points - self.centre, up, angle)
 
-        return dataclasses.replace(self, hull=turn(self.hull), points=turn(self.points), base=turn(self.base))
+        return dataclasses.replace(
+            self,
+            hull=turn(self.hull),
+            points=turn(self.points),
+            surface=Surface(turn(self.surface.centres), rotated(self.surface.areas, up, angle)),
+            base=turn(self.base),
+        )
 
 
 def rotated(points: Array, axis: Array, angle: float) -> Array:
@@ -201,6 +250,7 @@ def thing_at_rest(scene: Scene, item: SceneObject, ground: Ground) -> Thing:
         item=item,
         hull=np.concatenate([corners, points[:: max(1, len(points) // 300)]]),
         points=points[:: max(1, len(points) // FINE_POINTS)],
+        surface=Surface.of(vertices, mesh.faces),
         centre=vertices.mean(axis=0),
         base=vertices[heights <= heights.min() + 0.06 * np.ptp(heights)],
         heights=(float(heights.min()), float(heights.max())),

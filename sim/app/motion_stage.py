@@ -62,8 +62,11 @@ LANDING = 0.4
 TURN = math.radians(20.0)
 """Turn about the vertical of what hops or slides, so that it is seen to be a body; more would show its back."""
 
-TURNS = (1.0, 0.0)
-"""Shares of it that are tried: what turns is wider, and may have no room."""
+TURNS = (1.0, 0.5, 0.0)
+"""Shares of it that are tried: what turns is wider, and may have no room, or shows a side that the photo does not."""
+
+GUESSED = 0.05
+"""Share of a thing's picture that may be of such sides after a move, beyond what was at rest (``Surface.guessed``)."""
 
 SLIDE_TURN = math.radians(15.0)
 """The same of a push: it is seen longer, and friction that stops a turn brakes the way less."""
@@ -97,8 +100,8 @@ PUSHES = tuple((math.cos(n * math.pi / 8), math.sin(n * math.pi / 8)) for n in (
 class Stage:
     """The objects of a scene, its camera, and the ground as the photo shows it."""
 
-    def __init__(self, scene: Scene, gravity: float, calm: Collection[str]) -> None:
-        self.scene, self.gravity, self.calm = scene, gravity, calm
+    def __init__(self, scene: Scene, gravity: float, calm: Collection[str] = (), plain: Collection[str] = ()) -> None:
+        self.scene, self.gravity, self.calm, self.plain = scene, gravity, calm, plain
         self.camera, self.ground = scene.model.camera, scene.model.ground_plane
         self.up = self.ground.unit_normal
         ahead = np.asarray(self.camera.world_from_camera, dtype=np.float64)[:3, 2]
@@ -205,7 +208,8 @@ class Stage:
                     aside=rounded(shift),
                     start_s=0.0,
                     flight_s=flight,
-                    settle_s=self._settle(thing, flight, slides=False),
+                    settle_s=sum(self._settle(thing, flight, slides=False)),
+                    pause_s=self._pause(thing, flight, slides=False),
                     velocity=rounded(rise * self.up + shift / flight),
                     spin=rounded(spin),
                 )
@@ -231,14 +235,16 @@ class Stage:
             far = SLIDE * share * thing.extent(way)
             speed = math.sqrt(2.0 * friction * self.gravity * far)
             time = speed / (friction * self.gravity)
-            turn = 0.0 if self._again(thing) else self._facing(thing, way) * 2.0 * share_turn * SLIDE_TURN / time
+            straight = self._again(thing) or thing.item.name in self.plain
+            turn = 0.0 if straight else self._facing(thing, way) * 2.0 * share_turn * SLIDE_TURN / time
             yield Move(
                 name=thing.item.name,
                 height=0.0,
                 aside=rounded(far * way),
                 start_s=0.0,
                 flight_s=time,
-                settle_s=self._settle(thing, time, slides=True),
+                settle_s=sum(self._settle(thing, time, slides=True)),
+                pause_s=self._pause(thing, time, slides=True),
                 velocity=rounded(speed * way),
                 spin=rounded(turn * self.up),
             )
@@ -247,16 +253,18 @@ class Stage:
         return max(0.1, math.sqrt(self.ground.friction * _own_friction(thing.item, self.ground)))
 
     def _spin(self, thing: Thing, way: Array, shift: Array, flight: float, share: float) -> Array:
-        """Return the spin (3,) rad/s: ``share`` of the turn about the vertical, and forwards over the way it goes, as
-        far as it will not fall over.
+        """Return the spin (3,) rad/s: ``share`` of the turn about the vertical, or, where that is 0, forwards over the
+        way it goes, as far as it will not fall over. Not both: what comes down on an edge while it turns rolls on about
+        its rim as a coin does, by as much again.
         """
-        if thing.carried or thing.round or _flows(thing.item) or not self.firm(thing):
+        if thing.carried or thing.round or _flows(thing.item) or thing.item.name in self.plain or not self.firm(thing):
             return np.zeros(3)
+        if share:
+            return self._facing(thing, way) * share * TURN * self.up / flight
         axis = np.cross(self.up, way)
-        turn = self._facing(thing, way) * share * TURN * self.up / flight
         # Leaning in the picture's plane shows most and turns nothing unseen to the camera.
         aslant = abs(float(way @ self.right)) / float(np.linalg.norm(way))
-        return turn + aslant * axis * min(LEAN * thing.tips(way, self.up), MOST_LEAN) / flight
+        return np.asarray(aslant * axis * min(LEAN * thing.tips(way, self.up), MOST_LEAN) / flight)
 
     def _facing(self, thing: Thing, way: Array) -> float:
         """Return the sign of the turn about the vertical by which ``thing`` faces the camera at the end of its way."""
@@ -315,7 +323,7 @@ class Stage:
         if rise < LEAST_RISE_PX * min(self.camera.width, self.camera.height):
             return None
         hides = self._hides(whole, others)
-        if hides > HIDDEN:
+        if hides > HIDDEN or self._guessed(thing, move) > max(GUESSED, self._guessed(thing)):
             return None
         # From where it stood in the photo, not from where it stands now: what came back has gone nowhere.
         home = self.camera.project(self.rest[thing.item.name].hull)[:, :2].mean(axis=0)
@@ -335,6 +343,14 @@ class Stage:
             - 2.0 * (float(beyond) / size if over else 0.0)
         )
 
+    def _guessed(self, thing: Thing, move: Move | None = None) -> float:
+        """Return the share of ``thing``'s picture, now or after ``move``, that the photo does not show."""
+        if thing.round or _flows(thing.item):
+            return 0.0
+        after = thing if move is None else thing.turned(self._turn(move), self.up).shifted(np.asarray(move.aside))
+        eye = np.asarray(self.camera.world_from_camera, dtype=np.float64)[:3, 3]
+        return self.rest[thing.item.name].surface.guessed(after.surface, eye)
+
     def _hides(self, whole: Array, others: Sequence[Thing]) -> float:
         """Return the largest share of a thing's picture that is hidden when the hulls ``whole`` (T, K, 3) have come to
         an end, beyond what was hidden at their beginning.
@@ -345,19 +361,25 @@ class Stage:
             most = max(most, after - before)
         return most
 
-    def _settle(self, thing: Thing, flight: float, *, slides: bool) -> float:
+    def _settle(self, thing: Thing, flight: float, *, slides: bool) -> tuple[float, float]:
         """Return how long ``thing`` moves, about, after it came down or stopped: bounces, and a wobble that takes
         longer the larger it is.
 
-        Rigid things hardly bounce here; what is round rolls on.
+        Each bounce of rigid things takes the same share of the one before; what is round rolls on.
         """
         wobble = 0.35 * math.sqrt(thing.item.size_m / 0.15)
         bounces = 0.7
         if thing.item.material.law == "rigid":
+            rebound = min(_rebound(thing.item, self.ground), 0.9)
             # What is narrow rocks.
             narrow = not slides and not thing.round and not self.firm(thing)
-            wobble, bounces = (1.0 if narrow else 0.1) * wobble, 1.5 if thing.round else 0.1
-        return (0.0 if slides else bounces * flight) + wobble
+            wobble, bounces = (1.0 if narrow else 0.1) * wobble, 1.5 if thing.round else rebound / (1.0 - rebound)
+        return 0.0 if slides else bounces * flight, wobble
+
+    def _pause(self, thing: Thing, flight: float, *, slides: bool) -> float:
+        """Return how long it is left alone then: what is rigid trips where it is pushed as it bounces."""
+        bounces, wobble = self._settle(thing, flight, slides=slides)
+        return (1.0 if thing.item.material.law == "rigid" else 0.5) * bounces + 0.5 * wobble
 
     def _run_out(self, thing: Thing, move: Move) -> Array:
         """Return how far (3,) it may go on after it came down, m."""
@@ -378,6 +400,12 @@ def _own_friction(item: SceneObject, ground: Ground) -> float:
     if item.friction is not None:
         return item.friction
     return ground.friction if item.roughness is None else 0.05 + 0.9 * item.roughness
+
+
+def _rebound(item: SceneObject, ground: Ground) -> float:
+    """Speed of leaving the ground over that of coming down, 0 to 1, of the rigid ``item``."""
+    given = max(item.restitution or 0.0, ground.restitution)
+    return given if item.restitution is not None or given > 0 else item.material.rigid_restitution
 
 
 def _peak(thing: Thing) -> float:

@@ -20,7 +20,8 @@ class Move:
 
     name: of the object. height: peak of its path over its rest, m; 0 of a push. aside: where it comes down or stops,
     (3,) m from its rest. start_s: when it begins. flight_s: from leaving to coming down, or to stopping. settle_s:
-    from then until it is at rest, about. velocity, spin: m/s and rad/s at the beginning.
+    from then until it is at rest, about. pause_s: from then until it may be moved again, no longer. velocity, spin: m/s
+    and rad/s at the beginning.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Move:
     start_s: float
     flight_s: float
     settle_s: float
+    pause_s: float
     velocity: Vector
     spin: Vector
 
@@ -55,6 +57,7 @@ class Move:
             aside=rounded(share**2 * np.asarray(self.aside)),
             flight_s=share * self.flight_s,
             settle_s=share * self.settle_s,
+            pause_s=share * self.pause_s,
             velocity=rounded(share * np.asarray(self.velocity)),
             spin=rounded(share * np.asarray(self.spin)),
         )

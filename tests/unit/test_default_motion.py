@@ -14,7 +14,7 @@ from physgen.batch.commands import photo_commands
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.clip_check import Clip, clip_notices, rehearsal_options, rehearsed
 from physgen.sim.app.default_motion import default_motion, tells_motion
-from physgen.sim.app.free_space import hidden_share
+from physgen.sim.app.free_space import Surface, hidden_share
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
 from physgen.sim.scene.material import load_preset
@@ -436,3 +436,90 @@ def test_what_is_narrow_and_alone_does_not_hop_on_the_spot_twice_in_a_row(table)
     assert motion.moves and any(move.on_the_spot for move in motion.moves)
     pairs = zip(motion.moves, motion.moves[1:], strict=False)
     assert not any(one.on_the_spot and other.on_the_spot for one, other in pairs)
+
+
+def turned(degrees):
+    return trimesh.transformations.rotation_matrix(math.radians(degrees), (0, 0, 1))[:3, :3]
+
+
+def test_guessed_sides_are_those_that_faced_away():
+    eye = np.array([0.0, -50.0, 0.0])
+    box = trimesh.creation.box((0.1, 0.05, 0.1)).subdivide().subdivide()
+    rest = Surface.of(box.vertices, box.faces)
+
+    def share(mesh, degrees):
+        now = Surface.of(mesh.vertices @ turned(degrees).T, mesh.faces)
+        return Surface.of(mesh.vertices, mesh.faces).guessed(now, eye)
+
+    # From afar: of a box half as deep as wide a side of 0.05 sin a appears beside the front's 0.1 cos a.
+    for degrees in (-40, 10, 40):
+        side = 0.5 * math.tan(math.radians(abs(degrees)))
+        assert share(box, degrees) == pytest.approx(side / (1 + side), abs=0.005)
+    assert share(box, 180) == pytest.approx(1.0, abs=0.005) and rest.guessed(rest, eye) == 0.0
+    # Of a round can the strip within 10 degrees of its edge counts as well.
+    can = trimesh.creation.cylinder(0.05, 0.1, sections=180)
+    edge, more = (0.5 * (1 - math.cos(math.radians(angle))) for angle in (10, 50))
+    assert share(can, 40) == pytest.approx(more - 0.5 * edge - 0.5 * edge, abs=0.01)
+
+
+def test_a_move_turns_no_guessed_side_to_the_camera_and_leans_or_turns_but_not_both(table):
+    """A can, 30 cm away: what came down leaning as it turned rolled on about its rim."""
+    can = trimesh.creation.cylinder(0.05, 0.12, sections=64).subdivide()
+    can.apply_translation((0, 0, 0.06))
+    for mesh in (
+        can,
+        trimesh.creation.box((0.1, 0.1, 0.12), transform=trimesh.transformations.translation_matrix((0, 0, 0.06))),
+    ):
+        scene = table([(0, 0, 0, 0.1, 0.1, 0.12)], ["wood"], looking_down(20, 0.6))
+        mesh.export(scene.root / "meshes/0.glb")
+        hop, *_ = default_motion(scene).moves
+        spin = np.asarray(hop.spin)
+        assert not hop.slides and spin.any() and (spin[2] == 0.0 or not spin[:2].any())
+        body = load_object_mesh(scene, scene.objects[0])
+        after = (body.vertices - body.vertices.mean(axis=0)) @ turned(math.degrees(spin[2] * hop.flight_s)).T
+        after += body.vertices.mean(axis=0) + hop.aside
+        eye = np.asarray(scene.model.camera.world_from_camera)[:3, 3]
+        assert Surface.of(body.vertices, body.faces).guessed(Surface.of(after, body.faces), eye) <= 0.06
+        assert default_motion(scene, plain=["box0"]).moves[0].spin == (0.0, 0.0, 0.0)
+
+
+def test_a_rehearsal_tells_what_shows_guessed_sides(table, tmp_path):
+    import physgen
+
+    scene = table([(0, 0, 0, 0.1, 0.1, 0.08)], ["wood"])
+    motion = default_motion(scene)
+    for number, (spin, names) in enumerate((((0.0, 0.0, 0.0), ()), ((0.0, 0.0, 4.0), ("box0",)))):
+        move = dataclasses.replace(motion.moves[0], velocity=(0.0, 0.0, 0.7), aside=(0.0, 0.0, 0.0), spin=spin)
+        tried = dataclasses.replace(motion, moves=(move,))
+        out = tmp_path / str(number)
+        bake = physgen.bake(tried.applied(scene), out=out, options=rehearsal_options(tried, BakeOptions()))
+        found = rehearsed(scene, bake, tried)
+        assert (found.turned, found.toppled) == (names, ())
+
+
+def test_what_bounces_is_left_alone_until_it_has_come_down_for_good(table):
+    """A can that was pushed as it bounced tripped, in a photo; wood leaves the ground with half of its speed."""
+    box = (0, 0, 0, 0.1, 0.1, 0.1)
+    hop, push, *_ = default_motion(table([box], ["wood"])).moves
+    bounces = sum(0.5**n for n in range(1, 4)) * hop.flight_s
+    assert not hop.slides and push.name == hop.name and push.start_s >= hop.landed_s + bounces
+    dead, after, *_ = default_motion(table([box], ["wood"], restitution=0.0)).moves
+    assert dead.flight_s == hop.flight_s and after.start_s - dead.landed_s < 0.5 * (push.start_s - hop.landed_s)
+
+
+def test_what_falls_over_in_a_later_move_is_spared_that_one(table, tmp_path):
+    import physgen
+
+    scene = table([(0, 0, 0, 0.06, 0.06, 0.1)], ["wood"], friction=3.0)
+    motion = default_motion(scene, plain=["box0"])
+    hop = dataclasses.replace(motion.moves[0], velocity=(0.0, 0.0, motion.moves[0].velocity[2]), aside=(0.0, 0.0, 0.0))
+    # Its foot sticks to the ground.
+    tripped = dataclasses.replace(hop, start_s=hop.landed_s + hop.pause_s, velocity=(1.2, 0.0, hop.velocity[2]))
+    motion = dataclasses.replace(motion, moves=(hop, tripped))
+    bake = physgen.bake(motion.applied(scene), out=tmp_path / "0", options=rehearsal_options(motion, BakeOptions()))
+    found = rehearsed(scene, bake, motion)
+    assert found.toppled == ("box0",) and found.good == {"box0": 1}
+    shorter = found.shortened(scene)
+    assert [move.velocity for move in shorter.moves] == [hop.velocity]
+    # Where already the first one goes wrong, fewer do not help.
+    assert dataclasses.replace(found, good={"box0": 0}).shortened(scene) is None
