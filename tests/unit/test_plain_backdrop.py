@@ -9,6 +9,7 @@ from physgen.sim.reconstruct.segmentation.box_segmentation import segment
 from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
 from physgen.sim.reconstruct.segmentation.plain_backdrop import (
     missing_parts,
+    on_blank_page,
     plain_backdrop,
     remnants,
     things_before_backdrop,
@@ -131,6 +132,42 @@ def test_a_strap_that_goes_on_to_the_photos_border_is_added_where_the_box_ends_t
     added = missing_parts(picture, body, box, plain_backdrop(picture))
     assert ((added & strap).sum() > 0.9 * (strap & ~body).sum()) == taken
     assert ((added & strap).sum() > 0.1 * strap.sum()) == taken
+
+
+LEG = (np.abs(COLUMNS - 160) < 20) & (ROWS >= 40)
+SOCK, SHOE = LEG & (ROWS >= 150) & (ROWS < 165), LEG & (ROWS >= 165) & (ROWS < 215)
+DOLL = LEG & (ROWS < 215)
+
+
+def doll(background=WHITE, gap=None):
+    """A doll with a highlight, white socks, and shoes of an uneven grey as a shadow's; a ``gap`` shows the page."""
+    grey = np.random.default_rng(2).normal(110.0, 20.0, (int(SHOE.sum()), 1)) * np.ones(3)
+    things = [(DOLL, (190, 120, 90)), (SOCK, (236, 236, 238)), (SHOE, grey), (ellipse(160, 80, 9, 14), (247, 246, 245))]
+    return photo(background, things if gap is None else [*things, (gap, background)])
+
+
+def test_all_that_hangs_together_on_a_blank_page_is_the_thing_but_for_gaps():
+    gap = (np.abs(COLUMNS - 160) < 8) & (np.abs(ROWS - 125) < 12)
+    picture, seen = doll(gap=gap), DOLL & (ROWS < 145) & ~gap
+    found = on_blank_page(picture, seen, (120, 30, 200, 225), plain_backdrop(picture))
+    assert found is not None
+    assert (found & DOLL & ~gap).sum() > 0.99 * (DOLL & ~gap).sum()
+    assert (found & cv2.erode(gap.astype(np.uint8), np.ones((5, 5))).astype(bool)).sum() == 0
+    assert (found & ~cv2.dilate(DOLL.astype(np.uint8), np.ones((7, 7))).astype(bool)).sum() == 0
+
+
+def test_a_page_with_shading_is_not_blank_and_what_leaves_the_box_is_not_cut():
+    seen = DOLL & (ROWS < 145)
+    for background in (sweep(), soft_shadow(WHITE, 160, 212)):
+        assert on_blank_page(doll(background), seen, (120, 30, 200, 225), plain_backdrop(doll(background))) is None
+    picture = doll()
+    assert on_blank_page(picture, seen, (120, 30, 200, 150), plain_backdrop(picture)) is None
+
+
+def test_a_doll_on_a_blank_page_keeps_socks_and_shoes():
+    mask = segment(doll(), (125, 28, 195, 228), "doll")
+    assert (mask & DOLL).sum() > 0.98 * DOLL.sum()
+    assert (mask & ~DOLL).sum() < 0.02 * DOLL.sum()
 
 
 def test_a_mask_that_lacks_nothing_is_left_alone():

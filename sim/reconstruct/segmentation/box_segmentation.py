@@ -34,7 +34,7 @@ from .mask_proposals import (
 )
 from .mirrored_outline import mirrored_outline
 from .outer_rim import outer_rim
-from .plain_backdrop import missing_parts, plain_backdrop
+from .plain_backdrop import missing_parts, on_blank_page, plain_backdrop
 from .strokes import Strokes, no_strokes
 
 Mask = NDArray[np.bool_]
@@ -176,7 +176,7 @@ def segment(
     found, closed, notices, sides = _coarse(crop, inner, taken, iterations, keep, drop)
     # A part that only contours speak for is as certain as a stroke: colours would drop it again.
     keep = keep | (closed & ~drop & ~taken)
-    gaps = np.zeros_like(taken)
+    gaps, whole = np.zeros_like(taken), None
     if not keep.any() and found.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
         sides = []
         notices = ["colour does not separate the object from the background; an ellipse in the box is used instead"]
@@ -197,7 +197,11 @@ def segment(
         if rim.any():
             found = settle_outline(crop, found | rim)
         backdrop = plain_backdrop(pixels)
-        if backdrop is not None:
+        if backdrop is not None and not taken.any() and not drop.any():
+            whole = on_blank_page(pixels, _at(found, pixels.shape, left, top), box, backdrop)
+        if whole is not None:
+            found, gaps = settle_outline(crop, whole[top:bottom, left:right]), np.zeros_like(taken)
+        elif backdrop is not None:
             lacking = missing_parts(pixels, _at(found, pixels.shape, left, top), box, backdrop)
             lacking = lacking[top:bottom, left:right] & ~taken & ~drop & ~gaps
             # A stroke that drops some of a part means all of it.
@@ -205,7 +209,9 @@ def segment(
             if lacking.any():
                 beside = cv2.dilate(lacking.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
                 found = np.where(beside, settle_outline(crop, found | lacking), found)
-    found = fill_holes(crop, _kept_part((found | keep) & ~drop & ~taken, taken, keep)) & ~gaps
+    found = _kept_part((found | keep) & ~drop & ~taken, taken, keep)
+    # On a blank page it is known which holes are open.
+    found = found if whole is not None else fill_holes(crop, found) & ~gaps
     if keep.any():
         # Between what is kept and the rest their mixed colours look like a third one: bridge the groove.
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))

@@ -78,6 +78,11 @@ FOOT = 0.35
 """Height over the object's above its foot, below which a part may be its shadow."""
 COLOURED = 10.0
 """Distance in CIELAB of a part there from a shade of the backdrop, above which it is no shadow."""
+BLANK, SHADED_SHARE, INK = 5, 0.001, 10
+"""Difference from the page's colour, in any channel, up to which a pixel is blank; the share of the page that may be
+otherwise; and the difference from which a pixel is the thing's."""
+HOLE = 0.95
+"""Share of an enclosed part that is blank where the page shows through: a highlight is not so even."""
 
 
 def plain_backdrop(pixels: Pixels) -> Mask | None:
@@ -201,6 +206,34 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     reach = round(SEAM * max(across, down)) + 1
     beside = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
     return np.asarray((full | (beside & _thin_between(mask, full, reach))) & ~mask & within)
+
+
+def on_blank_page(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], backdrop: Mask) -> Mask | None:
+    """Return all (H, W) of the object ``mask`` (H, W) in ``box`` on a blank page, as of cut-outs; None on others.
+
+    A page without any shading shows no shadow, so all that is not blank and hangs together is the thing: white socks, a
+    foot of a shadow's colour. None too where it goes on beyond the box. backdrop: (h, w), the reached page.
+    """
+    page = np.median(_copy(pixels)[backdrop], axis=0)
+    calm = cv2.erode(backdrop.astype(np.uint8), _disc(2 * SEAM)) > 0
+    if not calm.any() or (np.abs(_copy(pixels)[calm] - page).max(axis=-1) > BLANK).mean() > SHADED_SHARE:
+        return None
+    apart = np.abs(pixels - page).max(axis=-1)
+    # A white collar hardly differs from the page: there colours and contours have decided.
+    thing = touching(apart > INK, mask) | (mask & (apart > BLANK))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~thing).astype(np.uint8), connectivity=4)
+    outside = np.unique(labels[_rim(mask.shape)])
+    areas = stats[:, cv2.CC_STAT_AREA]
+    blank = np.bincount(labels[apart <= BLANK], minlength=len(areas)) / areas
+    filled = (areas < LEAST_PART * thing.sum()) | (blank < HOLE)
+    filled[outside] = False
+    thing |= filled[labels]
+    x0, y0, x1, y1 = _to_border(box, mask.shape)
+    beyond = thing.copy()
+    beyond[y0:y1, x0:x1] = False
+    if beyond.any() or not (thing & mask).sum() > 0.5 * mask.sum():
+        return None
+    return np.asarray(thing)
 
 
 def _to_border(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
