@@ -141,8 +141,11 @@ class Stage:
         hops = [[self._tries(thing, share) for share in LOWER]]
         pushes = [[self._pushes(thing, share) for share in LOWER]]
         ways = [*pushes, *hops] if self._slides_better(thing) else [*hops, *pushes]
-        if name in self.calm or self._rocks(thing):
+        if name in self.calm:
             ways = hops
+        elif self._rocks(thing):
+            # A push while it rocks trips it, so only where it cannot hop; a rehearsal drops it if it falls.
+            ways = [*hops, *pushes]
         if set(self._trails) <= {name}:
             # Something that fills the picture may leave it by a little, alone, at last; lower peaks only show less.
             ways.append([self._tries(thing, share) for share in LOWER[::-1]])

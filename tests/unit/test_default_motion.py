@@ -438,6 +438,14 @@ def test_what_is_narrow_and_alone_does_not_hop_on_the_spot_twice_in_a_row(table)
     assert not any(one.on_the_spot and other.on_the_spot for one, other in pairs)
 
 
+def test_what_is_narrow_and_fills_the_picture_is_pushed_more_than_once(table):
+    # It stands firmly along its width, not along its depth; above it there is no room.
+    scene = table([(0, 0, 0, 0.15, 0.05, 0.25)], camera=looking_down(15, 0.9, focal=520.0))
+    shifted = dataclasses.replace(scene.model.camera, cy=156.0)
+    motion = default_motion(save_scene(scene.root, dataclasses.replace(scene.model, camera=shifted)))
+    assert len(motion.moves) > 1 and all(move.slides for move in motion.moves)
+
+
 def turned(degrees):
     return trimesh.transformations.rotation_matrix(math.radians(degrees), (0, 0, 1))[:3, :3]
 
