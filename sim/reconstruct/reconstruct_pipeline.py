@@ -29,6 +29,7 @@ from ..scene.scene_output import PHYSICS_FILE, replacing_folder
 from ..trust import trusted_spec
 from .adapters.resolve import resolve
 from .appearance.appearance_estimate import ObjectAppearance, estimate_appearances
+from .appearance.fur import is_furry
 from .camera import ground_camera as cameras
 from .camera.camera_estimate import CameraEstimate, estimate_camera, metres_per_unit
 from .camera.depth_map import DepthMap, read_depth
@@ -241,7 +242,12 @@ def reconstruct_photo(
             store=store,
             steps=steps,
         )
-        physics = decided_by_shapes(physics, [body.shape for body in bodies], [body.size for body in bodies])
+        physics = decided_by_shapes(
+            physics,
+            [body.shape for body in bodies],
+            [body.size for body in bodies],
+            [is_furry(picture.pixels, mask) for mask in seen],
+        )
         for name, decided in zip(names, physics, strict=True):
             steps.notice(describe_decision(name, decided))
         (folder / "light").mkdir()

@@ -198,6 +198,13 @@ def test_shape_decides_where_nothing_else_did():
         assert decided_by_shape(known, "box") == known
 
 
+def test_what_looks_furry_and_has_no_plain_shape_is_plush():
+    physics = decided_by_shape(decided(), "inflated", furry=True)
+    assert to_material(physics) == load_preset("plush") and physics.source == "seen"
+    assert describe_decision("it", physics).startswith("it: plush, 200 kg/m³, as it looks furry")
+    assert decided_by_shape(decided(), "box", furry=True).preset == "wood"
+
+
 def test_a_modulus_of_real_matter_becomes_a_class():
     for modulus, name in ((2e4, "soft"), (5e6, "medium"), (2e8, "medium"), (1e10, "hard"), (7e10, "hard")):
         assert stiffness_of_modulus(modulus) == name
@@ -228,8 +235,9 @@ def test_things_that_are_alike_are_of_the_same_matter():
     (unknown,) = decide_materials([ObjectRequest(box=BOX)], [None], None, shipped_names())
     (chosen,) = decide_materials([ObjectRequest(box=BOX, preset="jelly")], [None], None, shipped_names())
 
-    def presets(shapes, sizes, physics=None):
-        return [item.preset for item in decided_by_shapes(physics or [unknown] * len(shapes), shapes, sizes)]
+    def presets(shapes, sizes, physics=None, furry=()):
+        known, fur = physics or [unknown] * len(shapes), furry or [False] * len(shapes)
+        return [item.preset for item in decided_by_shapes(known, shapes, sizes, fur)]
 
     alike = [(1.0, 0.5), (1.1, 0.46), (0.95, 0.53)]
     assert presets(["inflated", "sphere", "inflated"], alike) == ["wood"] * 3
@@ -239,3 +247,6 @@ def test_things_that_are_alike_are_of_the_same_matter():
     # A ball and a box that is twice as large keep their own, and nothing is changed that was decided.
     assert presets(["box", "sphere"], [(2.0, 0.5), (1.0, 0.5)]) == ["wood", "medium"]
     assert presets(["inflated", "sphere"], alike[:2], [chosen, unknown]) == ["jelly", "medium"]
+    # What has fur is of it, whatever stands beside it.
+    assert presets(["inflated", "inflated"], alike[:2], furry=[True, False]) == ["plush", "wood"]
+    assert presets(["inflated"], alike[:1], [chosen], [True]) == ["jelly"]

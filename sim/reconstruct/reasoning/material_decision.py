@@ -24,9 +24,10 @@ DEFAULT_PRESET = "medium"
 
 UNIDENTIFIED = {"sphere": DEFAULT_PRESET}
 RIGID_PRESET = "wood"
+FURRY_PRESET = "plush"
 """Presets of what could not be identified, by the shape of its body. Fruit and balls are round and yield; most else
 that stands on a table or a floor keeps its shape in a small fall, and a camera or a book that folds like rubber is not
-believed.
+believed. What has fur and is none of these shapes is a plush toy.
 """
 
 ALIKE = 1.2
@@ -48,7 +49,7 @@ class ObjectPhysics:
     interior is filled. size_m: largest extent in metres, and size_source; None if unknown. roughness: of its surface, 0
     (polished) to 1 (coarse), and friction, the Coulomb coefficient that follows; None uses the ground's. metallic,
     appearance_roughness: of its shader, 0 to 1; None if unknown. source: of the material: "chosen" by the user,
-    "asked", "named" in the table, or "default".
+    "asked", "named" in the table, "seen" by its texture, or "default".
     """
 
     name: str | None
@@ -131,24 +132,41 @@ def _decided(
     )
 
 
-def decided_by_shape(physics: ObjectPhysics, shape: str) -> ObjectPhysics:
-    """Return ``physics`` with the preset that suits ``shape`` (``BuiltBody.shape``) if nothing else decided it."""
+def decided_by_shape(physics: ObjectPhysics, shape: str, *, furry: bool = False) -> ObjectPhysics:
+    """Return ``physics`` with the preset that suits ``shape`` (``BuiltBody.shape``) if nothing else decided it.
+
+    furry: whether it looks as if it were of fur (``fur.is_furry``), which counts for bodies inflated from outlines.
+    """
     if physics.source != "default":
         return physics
-    preset = UNIDENTIFIED.get(shape, RIGID_PRESET)
+    soft = furry and shape == "inflated"
+    preset = FURRY_PRESET if soft else UNIDENTIFIED.get(shape, RIGID_PRESET)
     material = load_preset(preset)
-    return replace(physics, preset=preset, density=material.density, youngs_modulus=material.youngs_modulus)
+    return replace(
+        physics,
+        preset=preset,
+        density=material.density,
+        youngs_modulus=material.youngs_modulus,
+        source="seen" if soft else physics.source,
+    )
 
 
 def decided_by_shapes(
-    physics: Sequence[ObjectPhysics], shapes: Sequence[str], sizes: Sequence[tuple[float, float]]
+    physics: Sequence[ObjectPhysics],
+    shapes: Sequence[str],
+    sizes: Sequence[tuple[float, float]],
+    furry: Sequence[bool],
 ) -> tuple[ObjectPhysics, ...]:
     """Return ``physics`` by ``decided_by_shape``, with one preset for things that are alike.
 
     A candy seen at its edge or in part is not recognised as round, and would be of wood among others of rubber. Of
     things alike in width and height (``sizes``), those count that nothing else decided; the shape of most of them is
-    that of all, round ones first.
+    that of all, round ones first. furry: as of ``decided_by_shape``.
     """
+    physics = [
+        decided_by_shape(item, shape, furry=True) if fur else item
+        for item, shape, fur in zip(physics, shapes, furry, strict=True)
+    ]
     unknown = [item.source == "default" for item in physics]
     decided = []
     for index, (item, shape) in enumerate(zip(physics, shapes, strict=True)):
@@ -188,6 +206,7 @@ def describe_decision(name: str, physics: ObjectPhysics) -> str:
         "chosen": "as you chose",
         "asked": "by the model's answer",
         "named": f"as usual for {physics.name!r}",
+        "seen": "as it looks furry; set its kind or preset if it is not",
         "default": "the default for its shape, as it was not identified; set its kind or preset",
     }[physics.source]
     size = "" if physics.size_m is None else f", {physics.size_m:.3g} m"
