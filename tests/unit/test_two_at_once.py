@@ -142,7 +142,7 @@ def test_nothing_writes_a_scene_that_another_command_changes(work):
     """The steps of `run` and of Python programs after a reconstruction: physics, motion, drops, a changed model."""
     scene = load_scene(work / "pair")
     jelly = Physics(presets=("jelly",))
-    times = {"flight_s": 1.0, "settle_s": 0.1, "start_s": 0.0}
+    times = {"flight_s": 1.0, "settle_s": 0.1, "pause_s": 0.1, "start_s": 0.0}
     move = Move(name="a", height=0.1, aside=(0, 0, 0), **times, velocity=(0, 0, 1), spin=(0, 0, 0))
     drop = Drop(name="c")
     command = [sys.executable, "-c", HOLDER, "pair"]

@@ -52,6 +52,8 @@ THICK = 3.0
 SLIVER = (2.5, 0.05)
 """How far, in pixels and over the size, parts of the mask outside of the new outline reach that are dropped: less is
 the edge's own width, more is a handle or an aerial."""
+BESIDE = 0.1
+"""Length over the size along which an edge over an added part goes on at both sides of it: a table's behind."""
 BELOW = 0.12
 """Largest height over the mask's of a part below it that neither side of the mask has: a foot, but no shadow."""
 
@@ -262,6 +264,23 @@ def _adds(outline: Mask, mask: Mask, edges: Field, axis: _Axis) -> bool:
         least = max(1.3 * CREST, STANDS_OUT * usual)
         below = float(np.flatnonzero(part.any(axis=1))[-1] - foot) / max(tall, 1.0)
         shadow = below > BELOW and float(either[part].mean()) < 0.5
-        if not shadow and (folded[outer] > CREST).mean() > CLOSED and float(np.median(folded[outer])) > least:
+        if (
+            not shadow
+            and not _goes_on(crest, part, BESIDE * size)
+            and (folded[outer] > CREST).mean() > CLOSED
+            and float(np.median(folded[outer])) > least
+        ):
             closed += float(part.sum())
     return closed > LEAST * float(mask.sum()) and closed > MOSTLY * added
+
+
+def _goes_on(crest: Field, part: Mask, length: float) -> bool:
+    """Whether the edge over ``part`` goes on for ``length`` pixels at both sides of it: then it is not the thing's."""
+    columns = np.flatnonzero(part.any(axis=0))
+    row, near, far = round(float(np.median(part[:, columns].argmax(axis=0)))), 3, 3 + max(4, round(length))
+    left, right = int(columns[0]), int(columns[-1]) + 1
+    if left < far or right + far > part.shape[1]:
+        return False
+    band = crest[max(0, row - 2) : row + 3].max(axis=0)
+    sides = band[left - far : left - near], band[right + near : right + far]
+    return all(float((side > CREST).mean()) > CLOSED for side in sides)
