@@ -302,6 +302,5 @@ def _guessed(scene: Scene, item: SceneObject, cache: Pc2Reader, count: int) -> N
     """Shares of the picture of ``item``, in the first ``count`` samples of ``cache``, that the photo does not show
     (``Surface.guessed``)."""
     faces = load_object_mesh(scene, item).faces
-    eye = np.asarray(scene.model.camera.world_from_camera, dtype=np.float64)[:3, 3]
     surfaces = [Surface.of(cache.sample(number).astype(np.float64), faces) for number in range(count)]
-    return np.array([surfaces[0].guessed(now, eye) for now in surfaces])
+    return np.array([surfaces[0].guessed(now, scene.model.camera.position) for now in surfaces])

@@ -351,8 +351,7 @@ class Stage:
         if thing.round or _flows(thing.item):
             return 0.0
         after = thing if move is None else thing.turned(self._turn(move), self.up).shifted(np.asarray(move.aside))
-        eye = np.asarray(self.camera.world_from_camera, dtype=np.float64)[:3, 3]
-        return self.rest[thing.item.name].surface.guessed(after.surface, eye)
+        return self.rest[thing.item.name].surface.guessed(after.surface, self.camera.position)
 
     def _hides(self, whole: Array, others: Sequence[Thing]) -> float:
         """Return the largest share of a thing's picture that is hidden when the hulls ``whole`` (T, K, 3) have come to

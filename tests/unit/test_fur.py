@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fur is told from prints, grain and smooth things by the texture inside the outline."""
+"""Fur is distinguished from prints, wood grain and smooth surfaces by its texture."""
 
 import cv2
 import numpy as np

@@ -28,7 +28,6 @@ than the box."""
 WHOLE = 0.12
 """Score that e times the area is worth when two candidates overlap."""
 
-
 FLUSH, SEAM = 0.7, 3
 """Share of the lower outline of a part that lies on the one below, and of that one's upper outline that lies under it,
 from which both are one thing; and how many pixels may be between them."""
