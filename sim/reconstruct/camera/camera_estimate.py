@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimate camera and metric scale from options, EXIF, a depth map, straight lines, things of alike size, and priors.
+"""Estimate camera and metric scale from options, EXIF, a depth map, straight lines, the objects, and priors.
 
 Where many things of alike size, such as coins on a table, are as large at the top of the photo as at its bottom, the
 camera looks down steeply. Size and viewpoint tell each other: Hoiem, Efros, Hebert, Putting Objects in Perspective
@@ -24,6 +24,7 @@ from .depth_map import DepthMap
 from .ground_camera import DEFAULT_PITCH_DEG
 from .ground_plane import GroundPlane, fit_ground_plane
 from .pose_posterior import CameraPrior, Gaussian, PosePosterior, infer_pose
+from .round_feet import pitch_from_round_feet
 from .vanishing_points import find_segments
 
 Box = tuple[float, float, float, float]
@@ -149,9 +150,12 @@ def estimate_camera(
     normal_source = _normal_source(options, plane, found)
     if normal_source == TYPICAL:
         alike = pitch_from_alike_sizes(things(), (width, height), found.focal, DEFAULT_PITCH_SIGMA_DEG)
-        if alike is not None:
-            prior = replace(prior, pitch=alike)
-            found, normal_source = infer_pose(lines, prior), "things of alike size"
+        told, source = alike, "things of alike size"
+        if told is None:
+            told, source = pitch_from_round_feet(masks, (width, height), found.focal), "round feet of objects"
+        if told is not None:
+            prior = replace(prior, pitch=told)
+            found, normal_source = infer_pose(lines, prior), source
     # The mean of poses with the given horizon does not have it itself.
     averages = np.array([[math.log(found.focal), found.pitch, found.roll]])
     camera = cameras.camera_above_ground(width, height, found.focal, *map(float, prior.completed(averages)[0, 1:]))
