@@ -38,6 +38,10 @@ SLOW = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 LEGIBLE_S = 0.5
 """Seconds of the clip that the longest flight should take, even if something still rolls at its end."""
 
+ENDED = 0.5
+"""Share of what follows the last move that a clip should show, if a move that repeats another can be left out for it:
+what bounces for long would else be cut high in the air."""
+
 LEAD_S, HOLD_S = 0.1, 0.25
 """Seconds of the clip before the first move, at least, and after the last object has come to rest."""
 
@@ -146,6 +150,9 @@ def fitted(
         settles = dict.fromkeys(SLOW, moves[-2].settle_s)
         return fitted(scene, moves[:-1], settles, fps=fps, frames=frames, slow=slow)
     near = min(SLOW, key=lambda each: abs(each - slow))
+    shorter = _without_repeat(moves)
+    if shorter and _seconds(moves, len(moves) * _apart(moves, slow), ENDED * settles[near], slow) > most:
+        return fitted(scene, shorter, settles, fps=fps, frames=frames, slow=slow)
     seconds = least[near] if frames is None else frames / fps
     apart = _apart(moves, slow)
     # What takes long to come to rest, as what rolls, would leave the others to the beginning of the clip.
@@ -172,6 +179,15 @@ def _apart(moves: Sequence[Move], slow: float) -> float:
         rest = before.pause_s if before.name == after.name else 0.0
         least = max(least, 0.5 * before.flight_s + rest + 0.5 * after.flight_s)
     return least
+
+
+def _without_repeat(moves: tuple[Move, ...]) -> tuple[Move, ...]:
+    """Return ``moves`` without the last hop on the spot of a thing that has moved before, unless it ends them; empty
+    where there is none. What comes later does not rely on it."""
+    for at in range(len(moves) - 2, 0, -1):
+        if moves[at].on_the_spot and any(move.name == moves[at].name for move in moves[:at]):
+            return (*moves[:at], *moves[at + 1 :])
+    return ()
 
 
 def _seconds(moves: Sequence[Move], middle: float, settle: float, slow: float) -> float:

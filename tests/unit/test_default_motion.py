@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from physgen.batch.commands import photo_commands
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.clip_check import Clip, clip_notices, rehearsal_options, rehearsed
-from physgen.sim.app.default_motion import default_motion, tells_motion
+from physgen.sim.app.default_motion import SLOW, default_motion, fitted, tells_motion
 from physgen.sim.app.free_space import Surface, hidden_share
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import load_scene, save_scene
@@ -531,3 +531,26 @@ def test_what_falls_over_in_a_later_move_is_spared_that_one(table, tmp_path):
     assert [move.velocity for move in shorter.moves] == [hop.velocity]
     # Where already the first one goes wrong, fewer do not help.
     assert dataclasses.replace(found, good={"box0": 0}).shortened(scene) is None
+
+
+def test_what_bounces_for_long_at_the_end_gets_time_instead_of_a_hop_that_repeats_another(table):
+    scene = table([(-0.1, 0, 0, 0.03, 0.1, 0.12), (0.1, 0, 0, 0.05, 0.05, 0.05)], ["wood", "medium"])
+    motion = default_motion(scene)
+    first = next(move for move in motion.moves if not move.slides)
+    again = dataclasses.replace(first, aside=(0.0, 0.0, 0.0), height=0.8 * first.height)
+    other = dataclasses.replace(again, name="box1" if first.name == "box0" else "box0")
+    moves = (first, again, other)
+    short, long = (fitted(scene, moves, dict.fromkeys(SLOW, settle), fps=24.0) for settle in (0.1, 1.6))
+    assert [move.name for move in short.moves] == [move.name for move in moves]
+    assert [move.name for move in long.moves] == [first.name, other.name]
+    assert long.frames / long.fps / long.slow - long.moves[-1].landed_s > 0.5
+    # What comes last stays, and so does what goes somewhere.
+    assert (
+        len(
+            fitted(
+                scene, (first, other, dataclasses.replace(other, start_s=0.0)), dict.fromkeys(SLOW, 1.6), fps=24.0
+            ).moves
+        )
+        == 3
+    )
+    assert len(fitted(scene, (first, first, other), dict.fromkeys(SLOW, 1.6), fps=24.0).moves) == 3
