@@ -147,6 +147,9 @@ def make_clean_plate(
     gloss = GroundGloss(reflectivity, roughness, correlation, by_chance, images, made["bare"])
     holes = tuple(hole | image for hole, image in zip(layers.holes, images, strict=True))
     union, mirrored = np.logical_or.reduce(layers.holes), np.logical_or.reduce(images)
+    # There the ground is hardly seen, as on the objects themselves.
+    lost = mirrored & ~unboxed & _strongly_changed(pixels, gloss.pixels)
+    union, unseen = union | lost, objects | lost
     steps.begin("background")
     fill = _filler(view, options, inpainter, unboxed, mirrored)
     filled = store.run(
@@ -154,13 +157,26 @@ def make_clean_plate(
         {
             **_fill_inputs(gloss.pixels, view, options),
             "hole": union,
-            "objects": objects,
+            "objects": unseen,
             "barred": unboxed,
             "mirrored": mirrored,
         },
-        partial(_filled, fill, gloss.pixels, union, objects),
+        partial(_filled, fill, gloss.pixels, union, unseen),
     )
     return replace(layers, holes=holes, background=filled["picture"]), gloss
+
+
+STRONG, STRONG_SIGMA = 0.15, 0.012
+"""Change of the photo's light by a mirror image, natural logarithm, above which what is left of its pattern shows; and
+standard deviation over which it is averaged, over the photo's longer side."""
+
+
+def _strongly_changed(pixels: Pixels, bare: Pixels) -> Mask:
+    """Where (H, W) taking the mirror images out of ``pixels`` has left ``bare`` (H, W, 3) hardly any ground to level:
+    errors of a few pixels and of the blur leave their pattern there in colours that no ground has."""
+    before, after = (np.log(image.astype(np.float32) + 4.0) for image in (pixels, bare))
+    change = cv2.GaussianBlur(np.abs(after - before).max(axis=-1), (0, 0), STRONG_SIGMA * max(pixels.shape[:2]))
+    return np.asarray(change > STRONG)
 
 
 def _gloss(

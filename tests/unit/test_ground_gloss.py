@@ -176,6 +176,31 @@ def test_the_background_keeps_no_mirror_image(tmp_path):
     assert none.reflectivity == 0.0
 
 
+def test_where_a_mirror_image_is_strong_the_ground_is_filled(tmp_path):
+    """A can's image in ice, whose blur was not quite right, left blue and orange spots on the plate."""
+    surface = book(WHITE, DARK, DARK, DARK, RED, DARK)
+    pixels, mask, ground = photo(surface, Ground(reflectivity=0.5, reflection_roughness=0.08), grain=0.02)
+    hole = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    nothing = np.zeros_like(mask)
+    layers = Layers((mask,), (mask,), (nothing,), (hole,), (pixels,), pixels, (0,), {})
+    filled = []
+
+    def inpainter(picture, where):
+        filled.append(where)
+        return np.where(where[..., None], ground, picture)
+
+    store, steps = StageCache(tmp_path, tmp_path, lambda text: None), Steps(2, lambda event: None, never)
+    made, gloss = make_clean_plate(
+        layers, pixels, [surface], VIEW, ReconstructOptions(), inpainter=inpainter, store=store, steps=steps
+    )
+    (image,) = gloss.images
+    apart = np.abs(np.log(pixels + 4.0) - np.log(ground + 4.0)).max(axis=-1)
+    strong = cv2.erode((image & ~hole & (apart > 0.3)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert strong.sum() > 300 and (filled[0] & strong).sum() > 0.95 * strong.sum()
+    assert not (filled[0] & ~hole & ~image).any()
+    assert psnr(made.background, ground, image) > psnr(gloss.pixels, ground, image) + 3.0
+
+
 def test_each_of_many_things_takes_its_own_pixels_and_not_the_photos():
     """It was 132 bytes of each pixel of the photo for each thing: 4 GB of twenty small ones in 1440 x 1080."""
     view = camera_above_ground(160, 120, 180.0, math.radians(20.0))

@@ -184,3 +184,18 @@ def test_silver_coins_on_white_that_touch_stay_each():
         # Circles are found on a grid of 1.5 pixels: a sickle of that width is 4 % of the coin.
         assert min((found.stay & mask).sum(), (found.whole & mask).sum()) > 0.95 * mask.sum()
     assert not (found.stay & discs[1]).any()
+
+
+@pytest.mark.parametrize("upside_down", [True, False])
+def test_a_mirror_image_in_polished_ground_is_no_thing(upside_down):
+    """A can's image in ice stayed in the photo when the can had left; another can before it stays."""
+    picture = plain()
+    can, below = np.zeros((2, HEIGHT, WIDTH), bool)
+    can[40:90, 100:130], below[92:142, 100:130] = True, True
+    label = np.zeros((50, 30, 3))
+    label[:16], label[16:34], label[34:] = (210.0, 205.0, 60.0), (30.0, 120.0, 200.0), (200.0, 60.0, 40.0)
+    picture[can] = label.reshape(-1, 3)
+    image = label[::-1] if upside_down else label
+    picture[below] = 0.6 * picture[below] + 0.4 * image.reshape(-1, 3)
+    stay = unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [can], CAMERA).stay
+    assert (stay & below).sum() == 0 if upside_down else (stay & below).sum() > 0.5 * below.sum()

@@ -63,6 +63,10 @@ of it that is an object's from which it is that object.
 """
 HIDDEN = 0.1
 """Share of a thing's outline along an object above which the thing continues behind it."""
+MIRROR_OFF = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
+"""Heights of an object by which the line at which it is mirrored may lie below the end of its mask."""
+MIRROR_INSIDE, MIRROR_LIKE = 0.7, 0.6
+"""Share of a mirror image that the object, turned over, covers; and its correlation with that, beside the ground."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +165,11 @@ def _look(pixels: NDArray[np.uint8], mask: Mask, objects: Mask, camera: Camera, 
     logs = np.log(cv2.GaussianBlur(light, (0, 0), 0.7).astype(np.float64) + 0.01)
     area = float(own.sum()) * size[0] * size[1] / own.size
     found, different = _things(logs, ground & ~covered, covered, area)
+    alone = cv2.resize(own.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     things = []
     for thing, behind in found:
+        if _is_mirror_image(thing, alone, logs, ground & ~covered):
+            continue
         full = np.zeros_like(mask)
         full[window] = cv2.resize(thing.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.25
         things.append((full, behind))
@@ -337,6 +344,35 @@ def _furniture(
         if outside.sum() >= 8 and float((apart[outside] < 0.7).mean()) > SHARP:
             result.append(own)
     return result
+
+
+def _is_mirror_image(part: Mask, own: Mask, logs: Values, open_ground: Mask) -> bool:
+    """Whether ``part`` (h, w) is what polished ground shows of the object ``own`` (h, w), upside down below it.
+
+    logs: (h, w, 3) logarithms of light. Faint or blurred as it is, its colours are the object's, at the same places.
+    """
+    rows = np.flatnonzero(own.any(axis=1))
+    if not len(rows) or np.argwhere(part)[:, 0].mean() <= rows[-1]:
+        return False
+    reach = max(2, round(0.25 * float(np.sqrt(part.sum()))))
+    around = (cv2.dilate(part.astype(np.uint8), _disc(reach)) > 0) & open_ground
+    ground = around & ~part
+    if ground.sum() < 8:
+        return False
+    y, x = np.nonzero(around)
+    seen = logs[y, x] - np.median(logs[ground], axis=0)
+    height = int(rows[-1]) - int(rows[0]) + 1
+    for off in MIRROR_OFF:
+        source = 2.0 * (rows[-1] + 0.5 + off * height) - y
+        at = np.clip(np.round(source).astype(int), 0, len(own) - 1)
+        covers = (source >= 0) & own[at, x]
+        if covers[part[y, x]].mean() < MIRROR_INSIDE:
+            continue
+        expected = np.where(covers[:, None], logs[at, x] - np.median(logs[ground], axis=0), 0.0)
+        a, b = (values - values.mean(axis=0) for values in (expected, seen))
+        if float((a * b).sum()) > MIRROR_LIKE * float(np.sqrt((a * a).sum() * (b * b).sum())) > 0.0:
+            return True
+    return False
 
 
 def _outline(part: Mask) -> Mask:
