@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from .contour_evidence import CREST
+from .mask_cleanup import enclosed_holes
 from .mask_proposals import BoxCrop, crop_around_box, edge_strength, ground_likelihood
 
 Mask = NDArray[np.bool_]
@@ -31,7 +32,7 @@ TILT = 0.09
 """Largest slope of the axis from the vertical."""
 ANGLES, JUMP = 220, 4
 """Rays around the middle, from up to down, and pixels by which the outline may move along them from one to the next."""
-FOLDED = 0.8
+FOLDED = 0.54
 """Overlap of a mask with its mirror image below which nothing is searched."""
 LOST, GAINED, ON_EDGES = 0.06, 0.3, 0.9
 """Largest share of the mask that the new outline leaves out, and that it adds; and the share of the outline on edges of
@@ -248,16 +249,18 @@ def _adds(outline: Mask, mask: Mask, edges: Field, axis: _Axis) -> bool:
         return np.asarray(cv2.dilate(part.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
     beyond = around(outline, 0.08 * size) & ~around(outline | mask, 3)
-    labels, count = ndimage.label(outline & ~mask, np.ones((3, 3)))
+    labels, count = ndimage.label(outline & ~mask & ~enclosed_holes(mask), np.ones((3, 3)))
     closed = added = 0.0
     for index in range(1, count + 1):
         part = labels == index
         if 2.0 * float(cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 3).max()) < THICK:
             continue
-        added += float(part.sum())
+        # So near the mask it is the edge's own width.
+        area = float((part & ~near).sum())
+        added += area
         outer = part & rim & ~near
         inner = cv2.erode(part.astype(np.uint8), kernel, borderValue=0) > 0
-        if not outer.any() or outer.sum() < MOUTH * (part & ~inner).sum():
+        if not outer.any() or (part & rim).sum() < MOUTH * (part & ~inner).sum():
             continue
         texture = beyond & around(part, 0.1 * size)
         usual = float(np.median(crest[texture if texture.sum() > 20 else beyond])) if beyond.any() else 0.0
@@ -270,7 +273,7 @@ def _adds(outline: Mask, mask: Mask, edges: Field, axis: _Axis) -> bool:
             and (folded[outer] > CREST).mean() > CLOSED
             and float(np.median(folded[outer])) > least
         ):
-            closed += float(part.sum())
+            closed += area
     return closed > LEAST * float(mask.sum()) and closed > MOSTLY * added
 
 

@@ -38,7 +38,7 @@ from .proposal_features import (
     solidity_of,
 )
 from .round_things import round_things
-from .whole_objects import Candidate, stacked_parts, whole_objects
+from .whole_objects import CUT, Candidate, stacked_parts, whole_objects
 
 Pixels = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
@@ -60,8 +60,6 @@ LEAST_SIDE = 0.035
 BESIDE = 0.06
 """Area over the largest object's below which a thing is left aside: a pebble beside a toy, a car far behind a hydrant.
 An orange beside a book has 0.10."""
-CUT = 0.02
-"""Share of its box' outline on the photo's border from which a thing is cut."""
 SIDES = 0.02
 """Strip along the photo's left and right border, over its width, that what goes through the photo reaches."""
 GROUND, THING = 0.7, 0.5

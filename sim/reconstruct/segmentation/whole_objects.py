@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .proposal_features import Mask, extent_of, hull_of, solidity_of
+from .proposal_features import Mask, cut_share, extent_of, hull_of, solidity_of
 
 GOOD = 0.8
 """Score of a candidate that may be an object of a group."""
@@ -28,6 +28,19 @@ than the box."""
 WHOLE = 0.12
 """Score that e times the area is worth when two candidates overlap."""
 
+CUT = 0.02
+"""Share of its box' outline on the photo's border from which a thing is cut."""
+AMID = 0.15
+"""Area of a thing over that of one around it which the photo's border cuts, from which that is the thing and what
+surrounds it."""
+STEP, BESIDE = 8.0, 3.0
+"""Step of colour in CIELAB that an outline has, and the pixels beside it over which colours are averaged: the texture
+of bark and grass has edges anywhere, but the same mean on both sides."""
+OUTLINED, OPEN, FAINTER = 0.95, 0.75, 0.33
+"""Share of its outline with such a step from which a thing is known to end there; share of it along the rest of a
+candidate below which that goes on beyond; and its median over the thing's. A plush before a tree had 1.00, 0.69 and
+0.29, a duck on its shadow 1.00, 0.48 and 0.08; parts of things had rests of 0.83 and more."""
+
 FLUSH, SEAM = 0.7, 3
 """Share of the lower outline of a part that lies on the one below, and of that one's upper outline that lies under it,
 from which both are one thing; and how many pixels may be between them."""
@@ -44,8 +57,9 @@ class Candidate(NamedTuple):
 def whole_objects(found: Sequence[Candidate], lab: NDArray[np.float32]) -> list[int]:
     """Return the numbers of those of ``found`` that are whole objects, none of which overlap.
 
-    A candidate is no object where others that stand on the ground by themselves make it up, or where it is another one
-    with some ground, lit or shaded. Of those left a whole goes before its parts, which often have the clearer outline.
+    A candidate is no object where others that stand on the ground by themselves make it up, where it is another one
+    with some ground, lit or shaded, or with some background that goes on beyond it, or where the photo's border cuts it
+    but not one in it. Of those left a whole goes before its parts, which often have the clearer outline.
     lab: (h, w, 3) CIELAB of the picture.
     """
     order = sorted(range(len(found)), key=lambda i: int(found[i].mask.sum()))
@@ -53,7 +67,7 @@ def whole_objects(found: Sequence[Candidate], lab: NDArray[np.float32]) -> list[
     extents = [item.mask for item in found]
     for i in order:
         inner = [j for j in kept if _within(found[j].mask, found[i].mask) > WITHIN]
-        if _is_group(found[i], [found[j] for j in inner], lab):
+        if _is_group(found[i], [found[j] for j in inner], lab) or _is_cut(found[i], [found[j] for j in inner], lab):
             continue
         without = next((j for j in inner if _has_ground(found[i], found[j], [found[k] for k in inner], lab)), None)
         if without is None:
@@ -158,7 +172,44 @@ def _has_ground(whole: Candidate, item: Candidate, inner: Sequence[Candidate], l
         if apart and other.score >= GOOD and not other.shade and float(other.mask.sum()) > 0.12 * area:
             return False
     dented = solidity_of(whole.mask) < solidity_of(item.mask) - 0.01
-    return dented and _rest_is_ground(item.mask, whole.mask, lab)
+    if dented and _rest_is_ground(item.mask, whole.mask, lab):
+        return True
+    return _stands_alone(item.mask, whole.mask) and _goes_on(item.mask, whole.mask, lab)
+
+
+def _goes_on(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> bool:
+    """Whether ``part`` ends at its outline, but ``whole`` without it, such as a tree behind, goes on beyond its own."""
+    own, rest = _steps(part, part, lab), _steps(whole & ~part, whole, lab)
+    if not len(own) or not len(rest) or (own > STEP).mean() < OUTLINED or (rest > STEP).mean() > OPEN:
+        return False
+    return float(np.median(rest)) < FAINTER * float(np.median(own))
+
+
+def _steps(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Steps of colour (n,) across the outline of ``whole`` where that is the outline of ``part``; not at the border."""
+    kernel = np.ones((3, 3), np.uint8)
+    inner = cv2.erode(whole.astype(np.uint8), kernel) > 0
+    means, seen = [], part & ~inner
+    for side in (part & inner, cv2.dilate(whole.astype(np.uint8), kernel) == 0):
+        weight = cv2.GaussianBlur(side.astype(np.float32), (0, 0), BESIDE)
+        total = cv2.GaussianBlur(lab * side[..., None].astype(np.float32), (0, 0), BESIDE)
+        means.append(total / np.maximum(weight, 1e-4)[..., None])
+        seen = seen & (weight > 0.01)
+    return np.asarray(np.linalg.norm(means[0] - means[1], axis=2)[seen], dtype=np.float32)
+
+
+def _is_cut(whole: Candidate, inner: Sequence[Candidate], lab: NDArray[np.float32]) -> bool:
+    """Whether the photo's border cuts ``whole``, but not a thing of ``inner`` amid it that ends at its outline."""
+    if cut_share(whole.mask) <= CUT:
+        return False
+    area = float(whole.mask.sum())
+    for item in inner:
+        share = float(item.mask.sum()) / area
+        if item.score < max(BETTER, whole.score) or item.shade or not AMID <= share <= MOST_PART:
+            continue
+        if cut_share(item.mask) <= CUT and (_steps(item.mask, item.mask, lab) > STEP).mean() >= OUTLINED:
+            return True
+    return False
 
 
 def _rest_is_ground(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> bool:
