@@ -61,6 +61,14 @@ def test_parts_that_colours_lose_come_back(lost):
     assert overlap(found(photo(), mask), whole) > 0.98
 
 
+def test_much_that_one_side_lacks_comes_back_and_a_hole_does_not_hinder_it():
+    """A can whose shoulder mirrors the ground: half of it is outside of the mask, some of the rest a hole in it."""
+    whole, hole = BODY | FOOT, drawn(("box", 124, 160, 150, 200))
+    mask = whole & ~drawn(("box", 160, 60, 222, 120)) & ~hole
+    assert overlap(mask, mask[:, ::-1]) < 0.7
+    assert overlap(found(photo(), mask) | hole, whole) > 0.98
+
+
 def test_a_whole_mask_stays_as_it_is():
     whole = BODY | FOOT
     assert (found(photo(), whole) == whole).all()

@@ -22,7 +22,7 @@ from physgen.sim.reconstruct.segmentation.object_proposals import (
     with_model,
     with_the_rest_aside,
 )
-from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width
+from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width, sharp_as
 from PIL import Image
 from scipy import ndimage
 
@@ -119,6 +119,22 @@ def test_things_are_in_focus_as_sharp_as_the_sharpest_one():
     image, masks = blurred_behind(sharp=True)
     assert in_focus(masks, image) == [False, False, True]
     assert in_focus(masks, blurred_behind(sharp=False)[0]) == [True, True, True]
+
+
+def test_what_is_softer_than_the_best_thing_on_a_fine_copy_is_not_as_sharp():
+    """A house behind a can, as sharp as a fruit's outline on the coarse copy, but not on a copy of twice its size."""
+    image, masks = np.full((480, 640, 3), 170.0), []
+    rows, columns = np.mgrid[:480, :640] + 0.5
+    for x, y, radius, colour in ((448, 136, 72, (30, 30, 40)), (320, 336, 80, (220, 180, 30))):
+        masks.append((columns - x) ** 2 + (rows - y) ** 2 < radius**2)
+        image = ndimage.gaussian_filter(image, (2.6, 2.6, 0))
+        image[masks[-1]] = colour
+    pixels = np.clip(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    small = [mask[::2, ::2] for mask in masks]
+    assert in_focus(small, np.ascontiguousarray(pixels[::2, ::2])) == [True, True]
+    assert sharp_as(1, small, pixels) == [False, True]
+    # Where the soft one is the best, the photo is of soft things.
+    assert sharp_as(0, small, pixels) == [True, True]
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])

@@ -62,6 +62,35 @@ def test_ground_beside_an_object_in_light_or_shade_is_no_part_of_it(shade):
     assert chosen([FRONT | cast, FRONT], [(cast & ~FRONT, BLUE), (FRONT, RED)], [0.99, 0.97]) == [0]
 
 
+def bark(mask, colour, seed=1):
+    """A ``mask`` with its colours (h, w, 3): those of a rough surface of the mean ``colour``."""
+    grain = cv2.GaussianBlur(np.random.default_rng(seed).normal(0.0, 1.0, SHAPE), (0, 0), 0.7)
+    rough = np.array(colour) * (1.0 + 0.5 * grain[..., None])
+    return mask, np.clip(rough, 0, 255).astype(np.uint8)[mask]
+
+
+def test_a_tree_behind_that_goes_on_is_no_part_of_it_and_a_dark_top_is():
+    """The rest of a candidate has edges along its outline wherever bark has them, but bark lies beyond it, too."""
+    plush, tree = block(40, 40, 60, 102) | block(40, 82, 100, 102), block(56, 0, 150, 84)
+    piece = block(60, 30, 110, 82)
+    colours = [bark(tree, (110, 100, 90)), (plush, RED)]
+    assert chosen([plush | piece, plush], colours, [0.96, 0.99]) == [1]
+    # One that ends there belongs to it, and so does the pale wall around a print.
+    assert chosen([plush | piece, plush], [bark(piece, (110, 100, 90)), (plush, RED)], [0.96, 0.99]) == [0]
+    box, print_ = block(40, 30, 110, 110), block(50, 50, 100, 90)
+    assert chosen([box, print_], [(box, (205, 186, 156)), (print_, RED)], [0.96, 0.99]) == [0]
+
+
+def test_one_amid_what_the_border_cuts_is_the_thing():
+    around = block(30, 0, 110, 90) | FRONT
+    colours = [(around, (90, 110, 60)), (FRONT, RED)]
+    assert chosen([around, FRONT], colours, [0.9, 0.98]) == [1]
+    # A thing that the border does not cut has parts; and what the border cuts, clearer than those in it, too.
+    whole = block(30, 10, 110, 90) | FRONT
+    assert chosen([whole, FRONT], [(whole, (90, 110, 60)), (FRONT, RED)], [0.9, 0.98]) == [0]
+    assert chosen([around, FRONT], colours, [0.98, 0.9]) == [0]
+
+
 def test_the_shadow_alone_is_no_object_beside_its_owner():
     cast = ((COLUMNS - 100) / 40.0) ** 2 + ((ROWS - 100) / 10.0) ** 2 < 1
     alone = cast & ~FRONT

@@ -24,7 +24,7 @@ from .mask_cleanup import largest_component
 from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
-from .outline_sharpness import in_focus
+from .outline_sharpness import in_focus, sharp_as
 from .plain_backdrop import FULL, things_before_backdrop
 from .proposal_features import (
     FEATURES,
@@ -104,6 +104,9 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
         [max(value for _, value in parts) for parts in things],
         [min(float(item.features[ground]) for item, _ in parts) for parts in things],
     )
+    if sum(value > LEFT_ASIDE for value in listed) > 1:
+        sharp = sharp_as(int(np.argmax(listed)), masks, pixels)
+        listed = [value if clear else min(value, LEFT_ASIDE) for value, clear in zip(listed, sharp, strict=True)]
     for mask, value in sorted(zip(masks, listed, strict=True), key=lambda pair: -pair[1])[:most]:
         x0, y0, x1, y1 = _loose(extent_of(mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))

@@ -30,6 +30,10 @@ OUT_OF_FOCUS = (4.0, 2.5)
 """Width in pixels, and over that of the sharpest thing, from which a thing is out of focus. A disc of uniform blur, of
 radius r, makes an edge 1.6 r wide; sharp photos have 1 to 2.5 on the copy, fur up to 3."""
 
+FINE = 640
+"""Longest side in pixels of the copy on which what is beside the best thing is compared with it: a house behind a can
+had 3 times the can's width there, and on the copy of half that size, where a sharp edge is not sharper, twice."""
+
 
 def outline_width(mask: Mask, lab: NDArray[np.float32]) -> float | None:
     """Return the median width in pixels of the edge along the outline of ``mask`` (h, w); None where nothing tells it.
@@ -74,3 +78,21 @@ def in_focus(masks: Sequence[Mask], pixels: NDArray[np.uint8]) -> list[bool]:
     least, more = OUT_OF_FOCUS
     limit = max(least, more * min((width for width in widths if width is not None), default=0.0))
     return [width is None or width <= limit for width in widths]
+
+
+def sharp_as(best: int, masks: Sequence[Mask], pixels: NDArray[np.uint8]) -> list[bool]:
+    """Return for each of ``masks`` (h, w), of any size, whether its outline in ``pixels`` (H, W, 3) is about as sharp
+    as that of the one with the number ``best``.
+
+    Sharp prints say nothing about a round fruit's soft outline, so it is the thing itself that is compared.
+    """
+    scale = min(1.0, FINE / max(pixels.shape[:2]))
+    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
+    lab = cielab(np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
+    widths = [
+        outline_width(np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5), lab)
+        for mask in masks
+    ]
+    least, more = OUT_OF_FOCUS
+    own = widths[best]
+    return [own is None or width is None or width <= max(least, more * own) for width in widths]
