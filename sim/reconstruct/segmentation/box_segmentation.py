@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from .contour_evidence import FINE, completed_by_contours, gaps_and_rods
 from .ground_shade import shaded_ground, without_ground
+from .limb_ends import limb_ends
 from .mask_cleanup import drop_ground_shadow, fill_holes, open_holes, settle_outline, smooth_outline, touching
 from .mask_proposals import (
     BoxCrop,
@@ -196,6 +197,9 @@ def segment(
         rim = outer_rim(crop, found, taken | drop)
         if rim.any():
             found = settle_outline(crop, found | rim)
+        ends = limb_ends(crop, inner, found, taken | drop)
+        if ends.any():
+            found = settle_outline(crop, found | ends)
         backdrop = plain_backdrop(pixels)
         if backdrop is not None and not taken.any() and not drop.any():
             whole = on_blank_page(pixels, _at(found, pixels.shape, left, top), box, backdrop)
