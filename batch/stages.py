@@ -230,13 +230,14 @@ def _rehearse(
 ) -> DefaultMotion:
     """Return ``motion`` with the speed and the clip that coarse bakes in ``folder`` suggest.
 
-    What falls over in one only hops straight up in the next, and stays where it is if it falls over even so. What
-    turns sides to the camera that the photo does not show neither turns nor leans in the next, then hops straight up.
-    What does either in a later move of its own is spared that one.
+    What falls over in one only hops straight up in the next, then to a quarter of the height, and stays where it is if
+    it falls over even so. What turns sides to the camera that the photo does not show neither turns nor leans in the
+    next, then hops straight up. What does either in a later move of its own is spared that one.
     """
     from ..sim.app.clip_check import MOST_REHEARSALS, rehearsal_options, rehearsed
     from ..sim.app.default_motion import default_motion
 
+    low: set[str] = set()
     calm: set[str] = set()
     plain: set[str] = set()
     still: set[str] = set()
@@ -257,11 +258,12 @@ def _rehearse(
         if shorter is not None and number < MOST_REHEARSALS - 1:
             motion = shorter
         elif fallen or turned:
-            still |= fallen & calm
+            still |= fallen & low
+            low |= fallen & calm
             calm |= fallen | (turned & plain)
             plain |= turned
             motion = default_motion(
-                scene, fps=options.fps, frames=frames, slow=slow, calm=calm, plain=plain, still=still
+                scene, fps=options.fps, frames=frames, slow=slow, calm=calm, plain=plain, low=low, still=still
             )
             if not motion.moves:
                 return motion

@@ -42,6 +42,9 @@ ENDED = 0.5
 """Share of what follows the last move that a clip should show, if a move that repeats another can be left out for it:
 what bounces for long would else be cut high in the air."""
 
+LOW = 0.5
+"""Share of its speed with which something hops that fell over: a quarter as high."""
+
 LEAD_S, HOLD_S = 0.1, 0.25
 """Seconds of the clip before the first move, at least, and after the last object has come to rest."""
 
@@ -97,6 +100,7 @@ def default_motion(
     slow: float | None = None,
     calm: Collection[str] = (),
     plain: Collection[str] = (),
+    low: Collection[str] = (),
     still: Collection[str] = (),
 ) -> DefaultMotion:
     """Return a motion for the objects of ``scene``, which are taken to be at rest: hops and pushes where there is room.
@@ -105,7 +109,7 @@ def default_motion(
     clear of other objects, and ends on ground that looks like the ground where it stands. fps: of the clip. frames,
     slow: its length, and how many times slower than real it is; None chooses them so that all of the motion is shown,
     in about three seconds. calm: names of objects that only hop straight up, and low. plain: of those that
-    neither turn nor lean. still: of those that stay at rest.
+    neither turn nor lean. low: of those that hop to a quarter of that height. still: of those that stay at rest.
 
     >>> import physgen
     >>> physgen.default_motion(physgen.load_scene("scene")).sentence  # doctest: +SKIP
@@ -113,7 +117,8 @@ def default_motion(
 
     Raises InputError for a mesh or clean plate that cannot be read.
     """
-    moves = _moves(scene, calm, plain, still)
+    chosen = _moves(scene, calm, plain, still)
+    moves = tuple(move.slower(LOW) if move.name in low else move for move in chosen)
     settle = moves[-1].settle_s if moves else 0.0
     return fitted(scene, moves, dict.fromkeys(SLOW, settle), fps=fps, frames=frames, slow=slow)
 

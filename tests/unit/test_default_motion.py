@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.commands import photo_commands
+from physgen.batch.stages import Choices, choose_motion
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
 from physgen.sim.app.clip_check import Clip, clip_notices, rehearsal_options, rehearsed
 from physgen.sim.app.default_motion import SLOW, default_motion, fitted, tells_motion
@@ -428,7 +429,29 @@ def test_what_falls_over_in_a_rehearsal_hops_calmly_and_else_stays(table, tmp_pa
     motion = dataclasses.replace(motion, moves=(calm,))
     bake = physgen.bake(motion.applied(scene), out=tmp_path / "1", options=rehearsal_options(motion, BakeOptions()))
     assert rehearsed(scene, bake, motion).toppled == ()
+    low, *_ = default_motion(scene, calm=["box0"], low=["box0"]).moves
+    assert low.height == pytest.approx(calm.height / 4) and low.velocity[2] == pytest.approx(
+        calm.velocity[2] / 2, rel=1e-4
+    )
     assert default_motion(scene, still=["box0"]).moves == ()
+
+
+def test_what_falls_over_as_it_hops_straight_up_hops_lower_before_it_stays(table, tmp_path):
+    """A can whose mask made a thin slab of it stood still for two seconds."""
+    scene = table([(0, 0, 0, 0.09, 0.022, 0.15)], ["wood"])
+    # As bodies are that were cut out: its foot is round, so that it comes down on a point.
+    mesh = load_object_mesh(scene, scene.objects[0])
+    vertices = mesh.vertices.copy()
+    vertices[:, 2] += 0.12 * np.abs(vertices[:, 1]) * (vertices[:, 2] < 0.001)
+    trimesh.Trimesh(vertices, mesh.faces).export(scene.root / scene.objects[0].mesh)
+    moved, _ = choose_motion(
+        scene,
+        BakeOptions(),
+        Choices(motion=True, frames=True, slow=True),
+        lambda event: None,
+        rehearsals=tmp_path / "r",
+    )
+    assert moved.objects[0].velocity[2] > 0.1 and (tmp_path / "r" / "2").is_dir()
 
 
 def test_what_is_narrow_and_alone_does_not_hop_on_the_spot_twice_in_a_row(table):
