@@ -35,6 +35,10 @@ FINE, COARSE = 0.0125, 0.2
 DETAIL = 0.003
 """Penalty on steps of the lack of light in logarithms times cells, over the hole's size in cells. A shadow that takes
 a tenth of the light is kept apart from the pattern if it is wider than an eighth of the hole."""
+CHECKED = 0.1
+"""Blur over the hole's size beyond which a prediction of the pattern is compared with the ground seen in the hole: a
+shadow's light is smooth below it but for edges, which no prediction knows. Measured slopes: 0.00 to 0.04 on rock, 1 on
+stripes."""
 HELD = 5.0
 """Weight of the known ground, which lacks nothing, over that of a cell of the hole."""
 SUDDEN = 0.06
@@ -234,7 +238,7 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     if around.sum() < FEWEST:
         around = cells.known
     altered = np.zeros_like(cells.hole) if changed is None else changed
-    chosen = _steps(((level + _foreseen(pattern, cells) - pattern) @ AXES.T).astype(np.float32), cells)
+    chosen = _steps((_foreseen(pattern, cells) + (level - pattern) @ AXES.T).astype(np.float32), cells)
     blurred = cv2.GaussianBlur(chosen, (0, 0), max(1.0, FINE * cells.side))
     sudden = (np.abs(chosen - blurred) > SUDDEN).any(axis=-1)
     usual = smoothed(pattern, cells.known, max(1.0, COARSE * cells.side)) @ AXES.T
@@ -266,13 +270,21 @@ def _continued_border(values: Picture, cells: _Cells) -> Picture:
 
 
 def _foreseen(pattern: Picture, cells: _Cells) -> Picture:
-    """What the known cells predict of ``pattern`` (h, w, 3) in the hole beyond its level; 0 elsewhere.
+    """What the known cells predict of ``pattern`` (h, w, 3) in the hole beyond its level, along ``AXES``; 0 elsewhere.
 
-    Broad stripes would else be taken for shadows.
+    Broad stripes would else be taken for shadows. It counts as far as the ground that is seen in the hole agrees: on an
+    irregular ground it is chance, and what is put back for it would be stains.
     """
     values = np.where(cells.known[..., None], pattern - pattern[cells.known].mean(axis=0), 0.0).astype(np.float32)
     found, _ = predict_texture(values, cells.known, cells.hole)
-    return np.where(cells.hole[..., None], found - _continued_border(found, cells), 0.0).astype(np.float32)
+    foreseen = np.where(cells.hole[..., None], found - _continued_border(found, cells), 0.0) @ AXES.T
+    seen, blur = cells.hole & ~cells.core, max(1.0, CHECKED * cells.side)
+    guess, truth = (
+        (values - smoothed(np.asarray(values, np.float32), seen, blur))[seen] for values in (foreseen, pattern @ AXES.T)
+    )
+    # The slope (3,) of what is seen over what was foreseen: 1 where it is right.
+    slope = (guess * truth).sum(axis=0) / (np.square(guess).sum(axis=0) + len(guess) * LEAST**2)
+    return np.asarray(foreseen * np.clip(slope, 0.0, 1.0), dtype=np.float32)
 
 
 def _steps(difference: Picture, cells: _Cells) -> Picture:
