@@ -70,6 +70,13 @@ BESIDE = 2.0
 BRIGHTER, MOST_BRIGHTER = 0.25, 0.15
 """Natural logarithm of a part's light over that beside it outside of the mask, above which no shade ends there; and the
 share of its rim there above which it is none."""
+SUNNY = -1.0
+"""Natural logarithm of a part's light over the lit ground's below which only a sun or lamp leaves so hard a shadow that
+its edge with lit ground outdoes any other: -2.8 was measured on rock by the sea."""
+ASIDE, SUNK = 0.7, 0.05
+"""Share of such a part that must lie beside the rest of the object, outside of its convex hull: a cast shadow lies flat
+on the ground, from where the object stands away from it. How much lower than the rest it may reach, and how far above
+the rest's foot may begin, over the rest's height: soles and wheels, as dark, lie below."""
 SHADED, DEEP = -0.15, -0.4
 """Natural logarithm of a pixel's light over the lit ground's below which ground is in shade; and for the median of a
 part: fainter shadows do not deceive a cut, but a bear of the floor's brown does."""
@@ -268,6 +275,19 @@ def _brighter_than_beyond(light: Light, part: Mask, mask: Mask, free: Mask, oute
     return np.asarray((means[0] - means[1])[seen], dtype=np.float32)
 
 
+def _cast_aside(part: Mask, border: Mask, own: Mask) -> bool:
+    """Whether ``part`` (h, w) leaves the object ``own`` (h, w) at its foot, as low as it stands, and goes away from it.
+    border: (h, w) pixels of ``own`` along it."""
+    body = largest_component(own)
+    rows = np.flatnonzero(body.any(axis=1))
+    foot, room = int(rows[-1]), SUNK * len(rows)
+    if np.nonzero(part)[0].max() > foot + room or np.nonzero(border)[0].max(initial=0) < foot - room:
+        return False
+    hull = np.zeros(part.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(body)[:, ::-1].astype(np.int32)), 1)
+    return bool((hull[part] == 0).mean() > ASIDE)
+
+
 def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple[Light, Light]) -> Mask:
     """Those of ``parts`` (h, w) that are like ground and no rougher, border on ground outside of ``mask``, strand
     nothing of the object ``own``, and that an edge parts from it, no weaker than their edge with the ground. judged:
@@ -295,7 +315,9 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
         on_edges = float((crest[inner] > EDGE).mean()) if inner.any() else 1.0
         if outer.sum() > GROUND_RIM * rim.sum():
             stronger = not inner.any() or bool(np.median(crest[inner]) > np.median(crest[outer]))
-            parted = on_edges > OBJECT_RIM and stronger and bool(np.median(brighter[part]) < DEEP)
+            depth = float(np.median(brighter[part]))
+            stronger = stronger or (depth < SUNNY and _cast_aside(part, inner, own))
+            parted = on_edges > OBJECT_RIM and stronger and depth < DEEP
         else:
             # The object encloses it: a gap, unless it is filled again as a print.
             parted = on_edges > GAP_RIM and bool(np.median(unlike[part]) < 0.5 * MIDDLE)
