@@ -390,6 +390,24 @@ def test_black_wheels_with_pale_hubs_are_no_shadow_of_the_car():
     assert mask[~(body | wheels | cast)].sum() < 0.03 * mask.sum()
 
 
+def test_a_hard_shadow_whose_edge_is_the_strongest_is_none_of_the_object():
+    """On pale rock in the sun: the ball is dark where its shadow begins, the rock beyond it bright."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ball = disc(200, 120, 50)
+    shadow = (((columns - 140) / 90) ** 2 + ((rows - 152) / 17) ** 2 < 1) & ~ball
+    image = np.array([165.0, 170, 172]) + (ground(3) - ground(3).mean(axis=(0, 1)))
+    image[shadow] *= np.array([0.19, 0.2, 0.22])
+    side = np.clip(0.5 + (columns - 200) / 100.0 - (rows - 120) / 120.0, 0.3, 1.0)[..., None]
+    image = np.where(ball[..., None], np.array([250.0, 205, 20]) * side, image)
+    photo = np.clip(ndimage.gaussian_filter(image, (0.7, 0.7, 0)), 0, 255).astype(np.uint8)
+    view = crop_around_box(photo, (45, 62, 256, 176), np.zeros_like(ball))
+    assert overlap(without_ground(view, ball | shadow), ball) > 0.97
+    # As dark a sole is lower than the rest.
+    sole = disc(200, 155, 40) & (rows > 160) & (rows < 180)
+    photo[sole] = (33, 34, 36)
+    assert without_ground(view, ball | sole)[sole].mean() > 0.95
+
+
 def test_a_brown_thing_on_brown_wood_is_not_given_back_to_the_ground():
     pixels, ball, _ = toy_with_a_double_shadow(2)
     # A lump of clay of nearly the wood's hue, as dark as its shadow.

@@ -176,3 +176,21 @@ def test_broad_stripes_in_a_shadow_stay():
     ratio = float(given[light].mean() / given[dark].mean())
     # 1.27 by truth; stripes that are taken for shadows would be levelled.
     assert ratio > 1.2
+
+
+def test_stripes_that_end_before_the_hole_leave_no_stains_in_it():
+    """A mat of red and blue stripes, and before it plain rock: what is foreseen in the hole is not what is seen there."""
+    stripes = np.sign(np.sin(np.arange(WIDTH, dtype=np.float32) * (2.0 * np.pi / 30.0)))[None, :, None]
+    mat = np.clip((90.0 - np.arange(HEIGHT, dtype=np.float32)) / 10.0, 0.0, 1.0)[:, None, None]
+    truth = 130.0 * np.exp(mat * stripes * np.array([0.16, 0.02, -0.12], np.float32))
+    truth += np.random.default_rng(6).normal(scale=4.0, size=(HEIGHT, WIDTH, 1)).astype(np.float32)
+    photo = truth * (1.0 - 0.1 * soft(disc(140, 125, 30), 6.0))
+    thing = disc(90, 120, 22)
+    photo[thing] = (220.0, 190.0, 20.0)
+    hole = disc(140, 128, 42) | disc(90, 120, 32)
+    given, left = relit(photo, hole, np.zeros_like(hole), thing)
+    kept = hole & ~left & (np.arange(HEIGHT) > 95)[:, None]
+    assert kept.sum() > 0.5 * (hole & ~disc(90, 120, 28)).sum()
+    tint = cv2.GaussianBlur(np.log(given[..., 0] / given[..., 2]), (0, 0), 2.0)
+    # The mat's stripes have 0.28, and go into the hole a little.
+    assert np.abs(tint[kept]).max() < 0.14
