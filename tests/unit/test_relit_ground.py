@@ -179,7 +179,7 @@ def test_broad_stripes_in_a_shadow_stay():
 
 
 def test_stripes_that_end_before_the_hole_leave_no_stains_in_it():
-    """A mat of red and blue stripes, and before it plain rock: what is foreseen in the hole is not what is seen there."""
+    """A striped mat, and plain rock before it: what is foreseen in the hole is not what is seen there."""
     stripes = np.sign(np.sin(np.arange(WIDTH, dtype=np.float32) * (2.0 * np.pi / 30.0)))[None, :, None]
     mat = np.clip((90.0 - np.arange(HEIGHT, dtype=np.float32)) / 10.0, 0.0, 1.0)[:, None, None]
     truth = 130.0 * np.exp(mat * stripes * np.array([0.16, 0.02, -0.12], np.float32))

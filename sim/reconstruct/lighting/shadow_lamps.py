@@ -30,8 +30,8 @@ LOWEST, HIGHEST = math.radians(15.0), math.radians(87.0)
 ANGLES = (0.05, 0.15, 0.4, 0.9)
 """rad; trial diameters of a lamp: from the real sun, blurred like the rough bodies, to a window nearby."""
 SHARES = (0.12, 0.22, 0.34, 0.45, 0.55, 0.64, 0.72, 0.79, 0.85, 0.93)
-"""Trial shares of the light, finer where the shadow's depth depends on it more. Under a clear sky a sun has 0.85 to 0.9,
-and a camera's contrast deepens its shadows: 0.06 of the light was measured in one on rock."""
+"""Trial shares of the light, finer where the shadow's depth depends on it more. Under a clear sky a sun has 0.85 to
+0.9, and a camera's contrast deepens its shadows: 0.06 of the light was measured in one on rock."""
 CHANGES = (0.6, 0.8, 1.0, 1.2)
 """Trial factors of the shares of lamps that are known when another is added."""
 USUAL_CHANGE = 0.8
@@ -46,11 +46,11 @@ MOST = 3.0
 """Limit of one pixel's log likelihood ratio: neighbours share their texture, and rough bodies have wrong edges."""
 UNCERTAIN, TINT = 0.13, 0.08
 """Uncertainty of a modelled shadow's log luminance, and least one of its log chromas."""
-TINT_SPREAD = 0.2
-"""The same of a shadow's tint: change of a log chroma over that of the log luminance. What light is left comes from the
-sky here, and from the object there."""
-DEPTHS = (0.4, 0.8, 1.4, 2.2, 3.0)
-"""Lost light, as a logarithm, up to which the tint of a shadow is as uncertain as half way from the last to there."""
+BOUNCED = 0.03
+"""Light of another tint, from the object here and from the sky there, over that of open ground: in a shadow, over what
+is left. It tinted the shadow of a yellow toy on rock by 0.6 in natural logarithms, at a depth of 2.8."""
+DEPTHS = (1.0, 1.6, 2.2, 2.8, 4.0)
+"""Lost light, as a logarithm, from which that shows, and the steps in which it is computed."""
 MOST_TINT = 0.4
 """Largest change of a log chroma over that of the log luminance."""
 DEEP, FEWEST_DEEP = -0.2, 30
@@ -165,13 +165,13 @@ class _Search:
         bare[0] -= depth
         bare[1] -= depth * tint[0]
         bare[2] -= depth * tint[1]
-        gained = np.empty(len(shaded))
-        classes = np.minimum(np.searchsorted(DEPTHS, -depth), len(DEPTHS) - 1)
-        for index, (least, most) in enumerate(pairwise((0.0, *DEPTHS))):
-            alike = classes == index
-            if alike.any():
-                spread = max(TINT, TINT_SPREAD * 0.5 * (least + most))
-                gained[alike] = self._texture.likelihood(bare[:, alike].T, UNCERTAIN, spread)
+        gained = self._texture.likelihood(bare.T, UNCERTAIN, TINT)
+        for least, most in pairwise(DEPTHS):
+            # Either in the tint of all shadows, or where light of another tint falls: whichever explains more.
+            alike = np.flatnonzero((-depth > least) & (-depth <= most))
+            if len(alike):
+                wide = self._texture.likelihood(bare[:, alike].T, UNCERTAIN, BOUNCED * math.exp(0.5 * (least + most)))
+                gained[alike] = np.maximum(gained[alike], wide)
         gained -= self._lit[shaded]
         return float(gained.clip(-MOST, MOST, out=gained).sum())
 

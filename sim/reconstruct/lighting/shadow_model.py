@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .ground_lighting import smooth_terms
 from .ground_pixels import LUMINANCE, GroundPixels, GroundTexture, fit_smooth, pixel_noise, relative_colour
-from .shadow_lamps import TINT_SPREAD, shadow_tint
+from .shadow_lamps import shadow_tint
 
 Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,6 +51,8 @@ GROWTH = (0.03,) * 8
 """Radius of propagation of levels over the object's size, step by step."""
 ALONG = 0.7
 """Weight of the neighbours against the cast shadow."""
+TINT_SPREAD = 0.2
+"""Uncertainty of a shadow's tint: change of a log chroma over that of the log luminance."""
 RIM_DEPTH, RIM_SPREADS = 0.5, 2.5
 """Lost light, as a logarithm, from which ground that touches an object is dark beside it; and the same over the spread
 of the ground."""
