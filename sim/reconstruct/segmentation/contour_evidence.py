@@ -77,13 +77,13 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask
     nothing = np.zeros_like(mask)
     if mask.sum() < 50:
         return Completed(mask, nothing, nothing)
-    regions = _thick_regions(view.pixels, max(20, int(0.004 * mask.sum())))
+    regions = thick_regions(view.pixels, max(20, int(0.004 * mask.sum())))
     crest = np.asarray(cv2.dilate(edge_strength(view.lab), np.ones((3, 3), np.uint8)), dtype=np.float32)
     result, doubtful = _with_bays(view, mask, regions, crest), nothing.copy()
     for _ in range(3):
         best: tuple[float, Mask] | None = None
         doubtful = nothing.copy()
-        for index in np.unique(regions[_around(result, 3) & view.inside]):
+        for index in np.unique(regions[ring_around(result, 3) & view.inside]):
             part = (regions == index) & ~result & ~view.others
             # A region that goes on outside of the box is ground.
             if (part & ~view.inside).sum() > 0.03 * max(1, part.sum()):
@@ -95,7 +95,7 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask
                 continue
             if shade is not None and shade()[part].mean() > SHADE_SHARE:
                 continue
-            solid, before = _solidity(_joined(result, part)), _solidity(result)
+            solid, before = _solidity(joined_with(result, part)), _solidity(result)
             if solid >= max(CONVEX, before - 0.03):
                 value = solid + 0.1 * float(part.sum()) / float(mask.sum())
                 best = (value, part) if best is None or value > best[0] else best
@@ -103,12 +103,12 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask
                 doubtful |= part
         if best is None:
             break
-        result = _joined(result, best[1]) & view.inside
+        result = joined_with(result, best[1]) & view.inside
     return Completed(result, result & ~mask, doubtful & ~result)
 
 
-def _thick_regions(pixels: NDArray[np.uint8], least: int) -> NDArray[np.int_]:
-    """Regions (h, w) of even colour of at least ``least`` pixels; seams of mixed colours go to the nearest of them."""
+def thick_regions(pixels: NDArray[np.uint8], least: int) -> NDArray[np.int_]:
+    """Return regions (h, w) of even colour of at least ``least`` pixels; seams of mixed colours go to the nearest of them."""
     regions = np.asarray(felzenszwalb(pixels, scale=60.0, sigma=0.5, min_size=least))
     edge = np.zeros(regions.shape, dtype=np.uint8)
     edge[:, 1:] |= regions[:, 1:] != regions[:, :-1]
@@ -122,20 +122,21 @@ def _thick_regions(pixels: NDArray[np.uint8], least: int) -> NDArray[np.int_]:
     return np.asarray(regions[tuple(nearest)])
 
 
-def _joined(mask: Mask, part: Mask) -> Mask:
-    """Both, with the seam of mixed pixels between them."""
+def joined_with(mask: Mask, part: Mask) -> Mask:
+    """Return both (h, w), with the seam of mixed pixels between them."""
     kernel = np.ones((3, 3), np.uint8)
     return np.asarray(cv2.morphologyEx((mask | part).astype(np.uint8), cv2.MORPH_CLOSE, kernel, iterations=2) > 0)
 
 
-def _around(mask: Mask, reach: int) -> Mask:
+def ring_around(mask: Mask, reach: int) -> Mask:
+    """Return the pixels (h, w) outside of ``mask`` and no farther from it than ``reach`` pixels."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
 
 
 def _has_contour(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) -> bool:
     """Whether ``part`` shares a long border with ``mask`` and has a contour of its own against everything else."""
-    rim = _around(part, 1)
+    rim = ring_around(part, 1)
     near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     own = rim & ~near
     if (rim & near).sum() < SHARED * rim.sum() or own.sum() < 0.2 * rim.sum():
@@ -143,27 +144,27 @@ def _has_contour(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floati
     if (crest[own] > CREST).mean() < CLOSED:
         return False
     inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    beyond = _around(part, 5) & ~_around(part, 2) & ~mask & ~near & ~view.others
+    beyond = ring_around(part, 5) & ~ring_around(part, 2) & ~mask & ~near & ~view.others
     if inner.sum() < 10 or beyond.sum() < 10:
         return False
     colour, outside = np.median(view.lab[inner], axis=0), view.lab[beyond]
     # Beyond every piece of its contour, not on average: ground of its colour would go on somewhere.
     if (np.linalg.norm(outside - colour, axis=1) < APART).mean() > 0.25:
         return False
-    return not _shade_of(colour, np.median(outside, axis=0))
+    return not is_shade_of(colour, np.median(outside, axis=0))
 
 
 def _with_bays(view: BoxCrop, mask: Mask, regions: NDArray[np.int_], crest: NDArray[np.floating]) -> Mask:
     """``mask`` (h, w) with the parts that fill a bay of it, made of ``regions`` (h, w) without an edge between them."""
     merged = _without_weak_borders(view, mask, regions, crest)
     result = mask
-    for index in np.unique(merged[_around(mask, 3) & view.inside]):
+    for index in np.unique(merged[ring_around(mask, 3) & view.inside]):
         part = (merged == index) & ~mask & ~view.others
         if (part & ~view.inside).any() or not LEAST_PART * mask.sum() <= part.sum() <= MOST_PART * mask.sum():
             continue
-        gain = (_solidity(_joined(mask, part)) - _solidity(mask)) * float(mask.sum()) / float(part.sum())
+        gain = (_solidity(joined_with(mask, part)) - _solidity(mask)) * float(mask.sum()) / float(part.sum())
         if gain > FILLED and _in_bay(view, part, mask, crest):
-            result = _joined(result, part) & (view.inside | mask)
+            result = joined_with(result, part) & (view.inside | mask)
     return result
 
 
@@ -199,7 +200,7 @@ def _in_bay(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) 
     A grey wing on a yellow body has the colour of grey ground in the shade. But ground that shows in a bay goes on
     beyond it, and a shadow that ends there by chance lies below what casts it.
     """
-    rim = _around(part, 1)
+    rim = ring_around(part, 1)
     near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     own = rim & ~near
     if (rim & near).sum() < BAY * rim.sum() or own.sum() < 0.2 * rim.sum():
@@ -207,7 +208,7 @@ def _in_bay(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) 
     if (crest[own] > CREST).mean() < CLOSED or np.median(crest[own]) < STANDS_OUT * CREST:
         return False
     inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    beyond = _around(part, 5) & ~_around(part, 2) & ~mask & ~near & ~view.others
+    beyond = ring_around(part, 5) & ~ring_around(part, 2) & ~mask & ~near & ~view.others
     if inner.sum() < 10 or beyond.sum() < 10:
         return False
     if (np.linalg.norm(view.lab[beyond] - np.median(view.lab[inner], axis=0), axis=1) < APART).mean() > 0.25:
@@ -221,8 +222,8 @@ def _in_bay(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) 
     return not _shows_ground(view, part, box, mask | part)
 
 
-def _shade_of(colour: NDArray[np.floating], ground: NDArray[np.floating]) -> bool:
-    """Whether ``colour`` is that of ``ground``, both CIELAB, in the shade."""
+def is_shade_of(colour: NDArray[np.floating], ground: NDArray[np.floating]) -> bool:
+    """Return whether ``colour`` is that of ``ground``, both CIELAB, in the shade."""
     factor = float((colour[0] + 16.0) / (ground[0] + 16.0))
     hue = float(np.linalg.norm(colour[1:] - factor * ground[1:]))
     return 0.5 < factor < 0.98 and hue < 6.0 + 0.12 * float(np.linalg.norm(ground[1:]))
@@ -287,7 +288,7 @@ def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None
         length = float(np.hypot(box[2], box[3]))
         if length < LONG * size or (ground[part] > usual).mean() < 0.4 or (ratio[part] < -0.5).mean() < 0.7:
             continue
-        rim = _around(part, 1) & core
+        rim = ring_around(part, 1) & core
         if (rim.any() and (crest[rim] > CREST).mean() < 0.6) or not _shows_ground(view, part, box, mask):
             continue
         candidates.append(part)
@@ -297,7 +298,7 @@ def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None
         inwards = cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3)
         if 2.0 * float(inwards.max()) > THIN * size + 3.0 or length < 0.06 * size:
             continue
-        rim = _around(part, 1) & ~mask
+        rim = ring_around(part, 1) & ~mask
         joined = (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & mask
         if not joined.any() or not rim.any() or (crest[rim] > CREST).mean() < 0.6 or (ratio[part] > 1.0).mean() < 0.6:
             continue
@@ -325,18 +326,18 @@ def _legs(view: BoxCrop, mask: Mask, unlike: NDArray[np.floating], crest: NDArra
     window = view.inside | mask
     ratio = np.where(window, np.clip(unlike, -4.0, 4.0), 0.0).astype(np.float32)
     cut = graph_cut(ratio, principal_contrast(view.lab), 1.0, barred=~window)
-    free = cut & view.inside & ~_around(mask, 1) & ~mask
+    free = cut & view.inside & ~ring_around(mask, 1) & ~mask
     result = []
     for part, (_, top, _, height) in _parts(free, 16):
         width = 2.0 * float(cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
         if not (height > UPRIGHT * width and height > 0.06 * size and width < LEG * size):
             continue
-        joint = np.flatnonzero((_around(part, SEAM) & mask).any(axis=1))
-        rim = _around(part, 1) & ~mask
+        joint = np.flatnonzero((ring_around(part, SEAM) & mask).any(axis=1))
+        rim = ring_around(part, 1) & ~mask
         hangs = len(joint) > 0 and joint[-1] < top + 0.25 * height
         if hangs and rim.any() and (crest[rim] > CREST).mean() > 0.6:
             # With the mixed pixels between them.
-            seam = _around(part, SEAM) & _around(mask, SEAM) & view.inside & part.any(axis=0)
+            seam = ring_around(part, SEAM) & ring_around(mask, SEAM) & view.inside & part.any(axis=0)
             result.append(part | seam)
     return result
 
@@ -357,7 +358,7 @@ def _between_slats(mask: Mask, candidates: Sequence[Mask], size: float) -> Mask:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     thick = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
     for part in candidates:
-        beside = _around(part, max(2, width // 4)) & solid
+        beside = ring_around(part, max(2, width // 4)) & solid
         if beside.any() and thick[beside].mean() <= SOLID_SHARE:
             gaps |= part
     return gaps

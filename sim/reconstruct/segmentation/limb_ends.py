@@ -19,10 +19,10 @@ from .contour_evidence import (
     FINE,
     SEAM,
     STANDS_OUT,
-    _around,
-    _joined,
-    _shade_of,
-    _thick_regions,
+    is_shade_of,
+    joined_with,
+    ring_around,
+    thick_regions,
 )
 from .mask_proposals import BoxCrop, crop_around_box, edge_strength
 
@@ -63,11 +63,11 @@ def limb_ends(pixels: NDArray[np.uint8], box: tuple[int, int, int, int], mask: M
     view = crop_around_box(small, (x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)), other)
     if own.sum() < 400:
         return np.zeros_like(mask)
-    regions = _thick_regions(view.pixels, max(20, int(0.001 * own.sum())))
+    regions = thick_regions(view.pixels, max(20, int(0.001 * own.sum())))
     crest = np.asarray(cv2.dilate(edge_strength(view.lab), np.ones((3, 3), np.uint8)), dtype=np.float32)
     depth = _depth(own)
     found = np.zeros_like(own)
-    for index in np.unique(regions[_around(own, SEAM) & view.inside]):
+    for index in np.unique(regions[ring_around(own, SEAM) & view.inside]):
         region = (regions == index) & ~own & ~other
         # What goes on outside of the box is ground.
         if region.any() and not (region & ~view.inside).any():
@@ -77,7 +77,7 @@ def limb_ends(pixels: NDArray[np.uint8], box: tuple[int, int, int, int], mask: M
     if not found.any():
         return np.zeros_like(mask)
     near = cv2.dilate(found.astype(np.uint8), np.ones((2 * SEAM + 1, 2 * SEAM + 1), np.uint8)) > 0
-    added = _joined(own, found) & near & ~own & view.inside
+    added = joined_with(own, found) & near & ~own & view.inside
     large = cv2.resize(added.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     return np.asarray(large) & ~mask & ~others
 
@@ -100,20 +100,20 @@ def _ends_limb(view: BoxCrop, part: Mask, mask: Mask, depth: NDArray[np.float32]
     if not LEAST * area <= float(part.sum()) <= MOST * area or width < WIDTH * size:
         return False
     near_mask = cv2.dilate(mask.astype(np.uint8), np.ones((2 * SEAM - 1, 2 * SEAM - 1), np.uint8)) > 0
-    rim = _around(part, 1)
+    rim = ring_around(part, 1)
     own = rim & ~near_mask
     if not SHARED[0] < float((rim & near_mask).sum()) / float(rim.sum()) < SHARED[1]:
         return False
     if (crest[own] > CREST).mean() <= CLOSED or np.median(crest[own]) <= STANDS_OUT * CREST:
         return False
-    limb = _around(part, round(REACH * (width + SEAM))) & mask
+    limb = ring_around(part, round(REACH * (width + SEAM))) & mask
     if not limb.any() or 2.0 * float(depth[limb].max()) >= LIMB * (width + SEAM):
         return False
     inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    beyond = _around(part, 5) & ~_around(part, 2) & ~near_mask & ~view.others
+    beyond = ring_around(part, 5) & ~ring_around(part, 2) & ~near_mask & ~view.others
     if inner.sum() < 10 or beyond.sum() < 10:
         return False
     colour, outside = np.median(view.lab[inner], axis=0), view.lab[beyond]
     if (np.linalg.norm(outside - colour, axis=1) < APART).mean() >= ALIKE:
         return False
-    return not _shade_of(colour, np.median(outside, axis=0))
+    return not is_shade_of(colour, np.median(outside, axis=0))
