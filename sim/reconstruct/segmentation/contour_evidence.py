@@ -108,7 +108,7 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask
 
 
 def thick_regions(pixels: NDArray[np.uint8], least: int) -> NDArray[np.int_]:
-    """Return regions (h, w) of even colour of at least ``least`` pixels; seams of mixed colours go to the nearest of them."""
+    """Return regions (h, w) of even colour of at least ``least`` pixels; seams of mixed colours go to the nearest."""
     regions = np.asarray(felzenszwalb(pixels, scale=60.0, sigma=0.5, min_size=least))
     edge = np.zeros(regions.shape, dtype=np.uint8)
     edge[:, 1:] |= regions[:, 1:] != regions[:, :-1]
