@@ -23,6 +23,7 @@ from physgen.sim.reconstruct.segmentation.object_proposals import (
     with_the_rest_aside,
 )
 from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width, sharp_as
+from physgen.sim.reconstruct.segmentation.proposal_features import lines_go_on, lines_of
 from PIL import Image
 from scipy import ndimage
 
@@ -318,3 +319,32 @@ def test_any_alpha_gives_boxes_within_the_picture(height, width, seed, broken):
 def test_a_photo_that_is_missing_is_named(tmp_path):
     with pytest.raises(InputError, match="no such photo"):
         propose(tmp_path / "nothing.jpg")
+
+
+def boards(seed=0):
+    """Boards with dark seams (200 x 300), lit from the side; and a grid of rows and columns."""
+    noise = np.random.default_rng(seed).normal(scale=3.0, size=(200, 300, 1))
+    picture = np.full((200, 300, 3), (150.0, 110.0, 70.0)) + noise
+    picture[24::40] = picture[25::40] = (60.0, 40.0, 30.0)
+    return picture, *np.mgrid[:200, :300]
+
+
+def test_lines_go_on_through_a_patch_of_light_but_not_through_a_thing():
+    """Sunlit boards of a bench flew beside a candle."""
+    picture, rows, columns = boards()
+    sunny = (np.abs(columns - 90) < 50) & (np.abs(rows - 100) < 70)
+    thing = (np.abs(columns - 220) < 30) & (np.abs(rows - 100) < 60)
+    # The sun is half a degree wide: light has soft edges.
+    picture *= 1.0 + 0.4 * ndimage.gaussian_filter(sunny.astype(float), 8.0)[..., None]
+    picture[thing] = (40.0, 90.0, 160.0)
+    lines = lines_of(np.clip(picture, 0, 255).astype(np.uint8))
+    assert lines_go_on(sunny, lines)
+    assert not lines_go_on(thing, lines)
+    # A single line may end behind a thing and begin again beside it by chance.
+    assert not lines_go_on(sunny, lines[:0])
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (8, 8), (9, 400)])
+def test_pictures_without_lines_have_none_that_go_on(shape):
+    plain = np.full((*shape, 3), 90, np.uint8)
+    assert not lines_go_on(np.ones(shape, bool), lines_of(plain))

@@ -24,7 +24,7 @@ from .mask_cleanup import largest_component
 from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
-from .outline_sharpness import in_focus, sharp_as
+from .outline_sharpness import FINE, in_focus, sharp_as
 from .plain_backdrop import FULL, things_before_backdrop
 from .proposal_features import (
     FEATURES,
@@ -33,6 +33,8 @@ from .proposal_features import (
     cut_share,
     extent_of,
     features_of,
+    lines_go_on,
+    lines_of,
     score_of,
     share_on_edges,
     solidity_of,
@@ -89,6 +91,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     found = [(item, score_of(item.features)) for item in examined_candidates(small)]
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
+    found = _ending(found, pixels)
     sharp = in_focus([item.mask for item, _ in found], small)
     found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
     shade, ground = FEATURES.index("shade"), FEATURES.index("ground")
@@ -113,6 +116,16 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
     alike = round_things(pixels, result, LEFT_ASIDE + 0.01)
     return with_model(alike or things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)[:most]
+
+
+def _ending(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[Examined, float]]:
+    """Those of ``found`` across whose outline no lines of ``pixels`` (H, W, 3) go on; all where none is left."""
+    scale = min(1.0, FINE / max(pixels.shape[:2]))
+    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
+    lines = lines_of(np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
+    large = (cv2.resize(item.mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5 for item, _ in found)
+    kept = [pair for pair, mask in zip(found, large, strict=True) if not lines_go_on(np.asarray(mask), lines)]
+    return kept or found
 
 
 def with_the_rest_aside(masks: Sequence[Mask], scores: Sequence[float], ground: Sequence[float]) -> list[float]:

@@ -19,6 +19,38 @@ OFFSET = -2.0
 """Logistic regression of ``FEATURES`` on whether a candidate is an object."""
 
 
+ACROSS, LEAST_ACROSS_PX = 0.06, 6.0
+"""Length on either side of an outline, over the thing's size and in pixels, from which a straight line crosses it."""
+LINES_ACROSS, ALL_ACROSS = 2, 0.25
+"""Lines that cross an outline, and the sum of their shorter sides over the thing's size, from which it is no outline of
+a thing. Of 76 things in photos none had two; boards lit by the sun had 0.36, tableware behind a lattice 1.4."""
+
+
+def lines_of(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the straight lines x0, y0, x1, y1 (n, 4) in ``pixels`` (H, W, 3), sRGB (LSD: Grompone von Gioi et al.,
+    TPAMI 2010)."""
+    found = cv2.createLineSegmentDetector().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))[0]
+    return np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
+
+
+def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
+    """Return whether ``lines`` (n, 4) go on across the outline of ``mask`` (H, W): a thing hides the lines behind it,
+    but light and prints lie on what has them."""
+    kernel = np.ones((5, 5), np.uint8)
+    inside = cv2.erode(mask.astype(np.uint8), kernel) > 0
+    outside = ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    size, height, width = float(np.sqrt(mask.sum())), *mask.shape
+    across = []
+    for x0, y0, x1, y1 in lines:
+        count = max(2, int(np.hypot(x1 - x0, y1 - y0)))
+        columns = np.clip(np.round(np.linspace(x0, x1, count)).astype(int), 0, width - 1)
+        rows = np.clip(np.round(np.linspace(y0, y1, count)).astype(int), 0, height - 1)
+        shorter = min(int(inside[rows, columns].sum()), int(outside[rows, columns].sum()))
+        if shorter >= max(LEAST_ACROSS_PX, ACROSS * size):
+            across.append(shorter)
+    return len(across) >= LINES_ACROSS and sum(across) > ALL_ACROSS * size
+
+
 def extent_of(mask: Mask) -> tuple[int, int, int, int]:
     """Return the box x0, y0, x1, y1 of ``mask`` (H, W), the last pixel exclusive."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
