@@ -232,7 +232,8 @@ def _rehearse(
 
     What falls over in one only hops straight up in the next, then to a quarter of the height, and stays where it is if
     it falls over even so. What turns sides to the camera that the photo does not show neither turns nor leans in the
-    next, then hops straight up. What does either in a later move of its own is spared that one.
+    next, then hops straight up. What does either in a later move of its own is spared that one. What leaves the picture
+    at a lower speed, too, stays where it is if something else moves.
     """
     from ..sim.app.clip_check import MOST_REHEARSALS, rehearsal_options, rehearsed
     from ..sim.app.default_motion import default_motion
@@ -254,11 +255,14 @@ def _rehearse(
         fallen = moved & set(found.toppled)
         # A hop straight up is the least there is.
         turned = (moved & set(found.turned)) - calm
+        # Even at a lower speed, as a stone that rolls; unless nothing else moves.
+        gone = moved & set(found.leaving) if number == MOST_REHEARSALS - 2 else set()
+        gone = gone if moved - gone else set()
         shorter = found.shortened(scene)
         if shorter is not None and number < MOST_REHEARSALS - 1:
             motion = shorter
-        elif fallen or turned:
-            still |= fallen & low
+        elif fallen or turned or gone:
+            still |= gone | (fallen & low)
             low |= fallen & calm
             calm |= fallen | (turned & plain)
             plain |= turned

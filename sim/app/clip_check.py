@@ -178,13 +178,13 @@ MOST_REHEARSALS = 4
 @dataclass(frozen=True, kw_only=True)
 class Rehearsed:
     """motion: with the clip that ends when nothing is seen to move any more. leaving: the warning about each object
-    that leaves the picture within that clip. toppled: names of the objects that fall over in it; turned: of those that
-    stay upright and yet show much of sides that the photo does not. good: for each of both how many of its moves had
-    come to an end before that. frames, slow: as asked for, None where they are chosen.
+    that leaves the picture within that clip, by its name. toppled: names of the objects that fall over in it; turned:
+    of those that stay upright and yet show much of sides that the photo does not. good: for each of both how many of
+    its moves had come to an end before that. frames, slow: as asked for, None where they are chosen.
     """
 
     motion: DefaultMotion
-    leaving: tuple[str, ...]
+    leaving: Mapping[str, str]
     toppled: tuple[str, ...] = ()
     turned: tuple[str, ...] = ()
     good: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -271,7 +271,7 @@ def rehearsed(
             good[item.name] = max(0, begun - 1)
     return Rehearsed(
         motion=clip,
-        leaving=tuple(text for text in gone if text),
+        leaving={name: text for name, text in zip(names, gone, strict=True) if text},
         toppled=tuple(lying),
         turned=tuple(turned),
         good=good,

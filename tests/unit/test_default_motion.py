@@ -260,7 +260,7 @@ def test_a_rehearsal_tells_when_a_motion_is_over_and_what_leaves(table, tmp_path
         return rehearsed(scene, bake, motion)
 
     found = rehearse(motion, 0)
-    assert found.leaving == ()
+    assert found.leaving == {}
     # It ends after it came down, soon, and the clip a little later.
     again = found.motion
     assert again.moves[-1].landed_s <= again.action_s < again.moves[-1].landed_s + 0.4
@@ -270,7 +270,7 @@ def test_a_rehearsal_tells_when_a_motion_is_over_and_what_leaves(table, tmp_path
     # Three times as fast sideways it slides out of the picture, which a hop of its own does not tell.
     fast = dataclasses.replace(move, velocity=(6.0 * np.sign(move.velocity[0]), 0.0, move.velocity[2]))
     gone = rehearse(dataclasses.replace(motion, moves=(fast,)), 1)
-    assert len(gone.leaving) == 1 and gone.leaving[0].startswith("box0 leaves the picture")
+    assert list(gone.leaving) == ["box0"] and gone.leaving["box0"].startswith("box0 leaves the picture")
     assert gone.tamed(scene).moves[0].velocity == pytest.approx(0.75 * np.asarray(fast.velocity))
 
 
@@ -577,3 +577,18 @@ def test_what_bounces_for_long_at_the_end_gets_time_instead_of_a_hop_that_repeat
         == 3
     )
     assert len(fitted(scene, (first, first, other), dict.fromkeys(SLOW, 1.6), fps=24.0).moves) == 3
+
+
+def test_what_rolls_out_of_the_picture_at_any_speed_stays_if_something_else_moves(table, tmp_path):
+    """A stone far behind a duck rolled out of the picture at the end of its clip."""
+    scene = table([(-0.25, 0, 0, 0.05, 0.05, 0.05), (0.08, 0, 0, 0.06, 0.06, 0.06)], ["wood"], friction=1.0)
+    trimesh.creation.icosphere(radius=0.025).apply_translation((-0.25, 0, 0.025)).export(
+        scene.root / scene.objects[0].mesh
+    )
+    # Downhill to the left, along which a ball rolls once it is awake.
+    model = dataclasses.replace(scene.model, gravity=(-3.0, 0.0, -9.0))
+    scene = scene.with_model(model).save()
+    options = BakeOptions(frames=108, slow=2.0)
+    moved, _ = choose_motion(scene, options, Choices(motion=True), lambda event: None, rehearsals=tmp_path / "r")
+    ball, box = moved.objects
+    assert ball.velocity == (0.0, 0.0, 0.0) and any(box.velocity)
