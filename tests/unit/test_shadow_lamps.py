@@ -2,7 +2,6 @@
 """Lamps found from the colours of ground that they shade, computed for a ball in closed form."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,28 +86,3 @@ def test_two_lamps_are_two_and_a_soft_sky_has_none_that_counts():
     for lamp in (first, second):
         assert min(off_deg(found, lamp) for found in light.lamps) < 7.5
     assert fit_light(lit_ground([]), [ball()]).share < 0.35
-
-
-def test_a_deep_shadow_in_the_light_that_a_yellow_ball_throws_back():
-    """What light is left in it comes from a blue sky, and beside the ball from the ball."""
-    sun = towards(160.0, 35.0)
-    ground = lit_ground([(sun, 0.93)])
-    beside = np.exp(-4.0 * (np.hypot(*ground.places.T) / RADIUS - 1.0))[:, None]
-    bounced = 0.4 * 0.15 * beside * np.array([1.2, 1.0, 0.3])
-    noise = np.random.default_rng(5).normal(scale=0.3, size=len(ground.rows))
-    # Rough ground: as much of all colours in sun and shade.
-    colour = np.log(np.exp(ground.colour) + bounced) + noise[:, None]
-    light = fit_light(replace(ground, colour=colour), [ball()])
-    assert off_deg(light.lamps[0], sun) < 7.5
-    assert light.share > 0.9
-
-
-def test_black_and_bright_grains_are_no_shadow():
-    """Near the camera grains are seen one by one; farther away they are a grey."""
-    ground = lit_ground([])
-    rng = np.random.default_rng(2)
-    count = len(ground.rows)
-    grains = np.where(rng.random(count) < 0.2, 2.5, -1.25) + rng.normal(scale=0.3, size=count)
-    grains *= ground.places[:, 1] < -0.1
-    light = fit_light(replace(ground, colour=ground.colour + grains[:, None]), [ball()])
-    assert light.share < 0.35

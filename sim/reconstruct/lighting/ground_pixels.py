@@ -236,13 +236,13 @@ def _distance(places: Values, bodies: Sequence[ProxyBody]) -> Values:
 
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-BINS = (360, 13, 13)
-LOW, HIGH = np.array([-3.2, -0.65, -0.65]), np.array([4.0, 0.65, 0.65])
+BINS = (240, 13, 13)
+LOW, HIGH = np.array([-3.2, -0.65, -0.65]), np.array([1.6, 0.65, 0.65])
 """Range of luminance and two chromas about the smooth part, natural logarithms."""
 _PER_UNIT = np.array(BINS) / (HIGH - LOW)
 FINEST = np.array([1.0, 0.6, 0.6])
 """Least smoothing of the histogram, in bins."""
-OTHER = 0.03
+OTHER = 0.02
 """Share of outliers: pixels of any colour that are not ground."""
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +28,14 @@ TURNS = 24
 LOWEST, HIGHEST = math.radians(15.0), math.radians(87.0)
 ANGLES = (0.05, 0.15, 0.4, 0.9)
 """rad; trial diameters of a lamp: from the real sun, blurred like the rough bodies, to a window nearby."""
-SHARES = (0.12, 0.22, 0.34, 0.45, 0.55, 0.64, 0.72, 0.79, 0.85, 0.93)
-"""Trial shares of the light, finer where the shadow's depth depends on it more. Under a clear sky a sun has 0.85 to
-0.9, and a camera's contrast deepens its shadows: 0.06 of the light was measured in one on rock."""
+SHARES = (0.12, 0.22, 0.34, 0.45, 0.55, 0.64, 0.72, 0.79, 0.85)
+"""Trial shares of the light, finer where the shadow's depth depends on it more."""
 CHANGES = (0.6, 0.8, 1.0, 1.2)
 """Trial factors of the shares of lamps that are known when another is added."""
 USUAL_CHANGE = 0.8
 LOSSES = (0.45, 0.7, 0.9)
 USUAL_LOSS = 0.7
-MOST_SHARE = 0.94
+MOST_SHARE = 0.88
 MOST_LAMPS = 3
 SKY = 90
 VISIBLE = 0.95
@@ -45,12 +43,7 @@ VISIBLE = 0.95
 MOST = 3.0
 """Limit of one pixel's log likelihood ratio: neighbours share their texture, and rough bodies have wrong edges."""
 UNCERTAIN, TINT = 0.13, 0.08
-"""Uncertainty of a modelled shadow's log luminance, and least one of its log chromas."""
-BOUNCED = 0.03
-"""Light of another tint, from the object here and from the sky there, over that of open ground: in a shadow, over what
-is left. It tinted the shadow of a yellow toy on rock by 0.6 in natural logarithms, at a depth of 2.8."""
-DEPTHS = (1.0, 1.6, 2.2, 2.8, 4.0)
-"""Lost light, as a logarithm, from which that shows, and the steps in which it is computed."""
+"""Uncertainty of a modelled shadow's log luminance and of its colour."""
 MOST_TINT = 0.4
 """Largest change of a log chroma over that of the log luminance."""
 DEEP, FEWEST_DEEP = -0.2, 30
@@ -165,14 +158,7 @@ class _Search:
         bare[0] -= depth
         bare[1] -= depth * tint[0]
         bare[2] -= depth * tint[1]
-        gained = self._texture.likelihood(bare.T, UNCERTAIN, TINT)
-        for least, most in pairwise(DEPTHS):
-            # Either in the tint of all shadows, or where light of another tint falls: whichever explains more.
-            alike = np.flatnonzero((-depth > least) & (-depth <= most))
-            if len(alike):
-                wide = self._texture.likelihood(bare[:, alike].T, UNCERTAIN, BOUNCED * math.exp(0.5 * (least + most)))
-                gained[alike] = np.maximum(gained[alike], wide)
-        gained -= self._lit[shaded]
+        gained = self._texture.likelihood(bare.T, UNCERTAIN, TINT) - self._lit[shaded]
         return float(gained.clip(-MOST, MOST, out=gained).sum())
 
     def kept(self, light: ShadowLight) -> Values:
