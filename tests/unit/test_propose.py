@@ -13,6 +13,7 @@ from physgen.batch.commands import photo_commands
 from physgen.sim.app import propose as propose_module
 from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, choose, propose
 from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.camera.vanishing_points import straight_lines
 from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.object_proposals import (
     LEFT_ASIDE,
@@ -23,7 +24,7 @@ from physgen.sim.reconstruct.segmentation.object_proposals import (
     with_the_rest_aside,
 )
 from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width, sharp_as
-from physgen.sim.reconstruct.segmentation.proposal_features import lines_go_on, lines_of
+from physgen.sim.reconstruct.segmentation.proposal_features import lines_go_on
 from PIL import Image
 from scipy import ndimage
 
@@ -337,7 +338,7 @@ def test_lines_go_on_through_a_patch_of_light_but_not_through_a_thing():
     # The sun is half a degree wide: light has soft edges.
     picture *= 1.0 + 0.4 * ndimage.gaussian_filter(sunny.astype(float), 8.0)[..., None]
     picture[thing] = (40.0, 90.0, 160.0)
-    lines = lines_of(np.clip(picture, 0, 255).astype(np.uint8))
+    lines = straight_lines(np.clip(picture, 0, 255).astype(np.uint8))
     assert lines_go_on(sunny, lines)
     assert not lines_go_on(thing, lines)
     # A single line may end behind a thing and begin again beside it by chance.
@@ -347,4 +348,4 @@ def test_lines_go_on_through_a_patch_of_light_but_not_through_a_thing():
 @pytest.mark.parametrize("shape", [(1, 1), (8, 8), (9, 400)])
 def test_pictures_without_lines_have_none_that_go_on(shape):
     plain = np.full((*shape, 3), 90, np.uint8)
-    assert not lines_go_on(np.ones(shape, bool), lines_of(plain))
+    assert not lines_go_on(np.ones(shape, bool), straight_lines(plain))

@@ -68,17 +68,22 @@ class Segments:
         return odds / (odds + 1.0 - share)
 
 
+def straight_lines(pixels: NDArray[np.uint8]) -> Array:
+    """Return the straight lines x0, y0, x1, y1 (n, 4) of ``pixels`` (H, W, 3) sRGB (LSD: Grompone von Gioi et al.,
+    TPAMI 2010)."""
+    found = cv2.createLineSegmentDetector().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))[0]
+    return np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
+
+
 def find_segments(pixels: NDArray[np.uint8], objects: NDArray[np.bool_]) -> Segments:
-    """Return segments (LSD: Grompone von Gioi et al., TPAMI 2010) of ``pixels`` (H, W, 3) sRGB, the longest first.
+    """Return straight segments of ``pixels`` (H, W, 3) sRGB, the longest first.
 
     objects: (H, W) mask of all objects. Segments along the photo's own border are dropped: they are picture frames.
     """
     height, width = objects.shape
     scale = min(1.0, LINE_SIZE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    grey = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-    found = cv2.createLineSegmentDetector().detect(grey)[0]
-    lines = np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
+    lines = straight_lines(np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
     small = cv2.resize(objects.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     return _weighed(lines + 0.5, np.asarray(small, dtype=np.uint8), scale)
 

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.segmentation import felzenszwalb
 
-from .mask_cleanup import enclosed_holes, touching
+from .mask_cleanup import enclosed_holes, ring_around, touching
 from .mask_proposals import (
     GROUND_PARTS,
     OBJECT_PARTS,
@@ -126,12 +126,6 @@ def joined_with(mask: Mask, part: Mask) -> Mask:
     """Return both (h, w), with the seam of mixed pixels between them."""
     kernel = np.ones((3, 3), np.uint8)
     return np.asarray(cv2.morphologyEx((mask | part).astype(np.uint8), cv2.MORPH_CLOSE, kernel, iterations=2) > 0)
-
-
-def ring_around(mask: Mask, reach: int) -> Mask:
-    """Return the pixels (h, w) outside of ``mask`` and no farther from it than ``reach`` pixels."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
 
 
 def _has_contour(view: BoxCrop, part: Mask, mask: Mask, crest: NDArray[np.floating]) -> bool:

@@ -21,9 +21,9 @@ from .contour_evidence import (
     STANDS_OUT,
     is_shade_of,
     joined_with,
-    ring_around,
     thick_regions,
 )
+from .mask_cleanup import ring_around
 from .mask_proposals import BoxCrop, crop_around_box, edge_strength
 
 Mask = NDArray[np.bool_]

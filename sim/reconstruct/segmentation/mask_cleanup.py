@@ -40,6 +40,12 @@ def largest_component(mask: Mask) -> Mask:
     return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
 
 
+def ring_around(mask: Mask, reach: int) -> Mask:
+    """Return the pixels (h, w) outside of ``mask`` and no farther from it than ``reach`` pixels."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
+
+
 def smooth_outline(mask: Mask, sigma: float | None = None) -> Mask:
     """Return ``mask`` without stair-steps and hairs: Gaussian blur, threshold at one half.
 

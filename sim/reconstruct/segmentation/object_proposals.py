@@ -19,6 +19,7 @@ from scipy import sparse
 from skimage.segmentation import felzenszwalb, slic
 
 from ...composite.srgb import cielab
+from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
 from .mask_cleanup import largest_component
 from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
@@ -29,12 +30,13 @@ from .plain_backdrop import FULL, things_before_backdrop
 from .proposal_features import (
     FEATURES,
     Mask,
+    at_size_of,
     contrast_of,
+    copy_of,
     cut_share,
     extent_of,
     features_of,
     lines_go_on,
-    lines_of,
     score_of,
     share_on_edges,
     solidity_of,
@@ -86,9 +88,8 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     sharp, those out of focus are left out; specks beside it and what the photo cuts come last. Before a plain backdrop
     the things on it come first. The list is empty where nothing stands out.
     """
-    scale = min(1.0, SIDE / max(pixels.shape[:2]))
-    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    small = copy_of(pixels, SIDE)
+    size = (small.shape[1], small.shape[0])
     found = [(item, score_of(item.features)) for item in examined_candidates(small)]
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
     found = _ending(found, pixels)
@@ -120,11 +121,9 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
 
 def _ending(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[Examined, float]]:
     """Those of ``found`` across whose outline no lines of ``pixels`` (H, W, 3) go on; all where none is left."""
-    scale = min(1.0, FINE / max(pixels.shape[:2]))
-    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
-    lines = lines_of(np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
-    large = (cv2.resize(item.mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5 for item, _ in found)
-    kept = [pair for pair, mask in zip(found, large, strict=True) if not lines_go_on(np.asarray(mask), lines)]
+    fine = copy_of(pixels, FINE)
+    lines = straight_lines(fine)
+    kept = [pair for pair in found if not lines_go_on(at_size_of(pair[0].mask, fine), lines)]
     return kept or found
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite.srgb import cielab
+from .proposal_features import at_size_of, copy_of
 
 Mask = NDArray[np.bool_]
 
@@ -86,13 +87,9 @@ def sharp_as(best: int, masks: Sequence[Mask], pixels: NDArray[np.uint8]) -> lis
 
     Sharp prints say nothing about a round fruit's soft outline, so it is the thing itself that is compared.
     """
-    scale = min(1.0, FINE / max(pixels.shape[:2]))
-    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
-    lab = cielab(np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
-    widths = [
-        outline_width(np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5), lab)
-        for mask in masks
-    ]
+    fine = copy_of(pixels, FINE)
+    lab = cielab(fine)
+    widths = [outline_width(at_size_of(mask, fine), lab) for mask in masks]
     least, more = OUT_OF_FOCUS
     own = widths[best]
     return [own is None or width is None or width <= max(least, more * own) for width in widths]

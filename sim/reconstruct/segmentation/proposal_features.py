@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .mask_cleanup import ring_around
+
 Mask = NDArray[np.bool_]
 FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
 """Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
@@ -26,11 +28,17 @@ LINES_ACROSS, ALL_ACROSS = 2, 0.25
 a thing. Of 76 things in photos none had two; boards lit by the sun had 0.36, tableware behind a lattice 1.4."""
 
 
-def lines_of(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the straight lines x0, y0, x1, y1 (n, 4) in ``pixels`` (H, W, 3), sRGB (LSD: Grompone von Gioi et al.,
-    TPAMI 2010)."""
-    found = cv2.createLineSegmentDetector().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))[0]
-    return np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
+def copy_of(pixels: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """Return ``pixels`` (H, W, 3) with a longer side of ``longest`` pixels at most, and sides of 8 at least."""
+    scale = min(1.0, longest / max(pixels.shape[:2]))
+    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def at_size_of(mask: Mask, picture: NDArray[np.uint8]) -> Mask:
+    """Return ``mask``, of any size, at that of ``picture`` (H, W, 3)."""
+    large = cv2.resize(mask.astype(np.float32), picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large > 0.5)
 
 
 def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
@@ -40,13 +48,16 @@ def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
     inside = cv2.erode(mask.astype(np.uint8), kernel) > 0
     outside = ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
     size, height, width = float(np.sqrt(mask.sum())), *mask.shape
+    least = max(LEAST_ACROSS_PX, ACROSS * size)
+    counts = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1]).astype(int)
     across = []
-    for x0, y0, x1, y1 in lines:
-        count = max(2, int(np.hypot(x1 - x0, y1 - y0)))
+    for (x0, y0, x1, y1), count in zip(lines, counts, strict=True):
+        if count < 2.0 * least:
+            continue
         columns = np.clip(np.round(np.linspace(x0, x1, count)).astype(int), 0, width - 1)
         rows = np.clip(np.round(np.linspace(y0, y1, count)).astype(int), 0, height - 1)
         shorter = min(int(inside[rows, columns].sum()), int(outside[rows, columns].sum()))
-        if shorter >= max(LEAST_ACROSS_PX, ACROSS * size):
+        if shorter >= least:
             across.append(shorter)
     return len(across) >= LINES_ACROSS and sum(across) > ALL_ACROSS * size
 
@@ -84,14 +95,9 @@ def features_of(
     )
 
 
-def _ring(mask: Mask, reach: int) -> Mask:
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
-
-
 def contrast_of(mask: Mask, lab: NDArray[np.float32]) -> float:
     """Distance of the mean colours of ``mask`` and of a ring around it, CIELAB."""
-    around = _ring(mask, max(3, round(0.12 * float(np.sqrt(mask.sum())))))
+    around = ring_around(mask, max(3, round(0.12 * float(np.sqrt(mask.sum())))))
     if not around.any():
         return 0.0
     return float(np.linalg.norm(lab[mask].mean(axis=0) - lab[around].mean(axis=0)))
@@ -133,7 +139,7 @@ def hull_of(mask: Mask) -> Mask:
 def _is_like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:
     """Whether ``mask`` may be nothing but shade: darker than the ring around it, of its hue, and as even."""
     size = float(np.sqrt(mask.sum()))
-    around = _ring(mask, max(4, round(0.2 * size)))
+    around = ring_around(mask, max(4, round(0.2 * size)))
     inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     if around.sum() < 20 or inner.sum() < 20:
         return False

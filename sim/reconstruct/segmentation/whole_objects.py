@@ -67,9 +67,10 @@ def whole_objects(found: Sequence[Candidate], lab: NDArray[np.float32]) -> list[
     extents = [item.mask for item in found]
     for i in order:
         inner = [j for j in kept if _within(found[j].mask, found[i].mask) > WITHIN]
-        if _is_group(found[i], [found[j] for j in inner], lab) or _is_cut(found[i], [found[j] for j in inner], lab):
+        things = [found[j] for j in inner]
+        if _is_group(found[i], things, lab) or _is_cut(found[i], things, lab):
             continue
-        without = next((j for j in inner if _has_ground(found[i], found[j], [found[k] for k in inner], lab)), None)
+        without = next((j for j in inner if _has_ground(found[i], found[j], things, lab)), None)
         if without is None:
             kept.append(i)
         else:
