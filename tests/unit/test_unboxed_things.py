@@ -139,6 +139,13 @@ def test_a_wall_is_no_thing_even_below_a_wrong_horizon(horizon):
     assert not unboxed_things(np.clip(picture, 0, 255).astype(np.uint8), [thing], view).stay.any()
 
 
+def test_a_picture_of_one_tint_holds_nothing():
+    """Rounding errors are no range of brightness: a filter so many bins wide takes 22 GB."""
+    pixels = np.full((HEIGHT, WIDTH, 3), (128, 130, 140), np.uint8)
+    view = camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(27.0))
+    assert not unboxed_things(pixels, [disc(120, 90, 30)], view).stay.any()
+
+
 def test_nothing_is_looked_for_without_an_object():
     found = unboxed_things(np.clip(plain(), 0, 255).astype(np.uint8), [np.zeros((HEIGHT, WIDTH), bool)], CAMERA)
     assert not found.stay.any()

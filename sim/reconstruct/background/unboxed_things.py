@@ -231,7 +231,9 @@ def _relative(logs: Values, known: Mask) -> tuple[Values, Mask]:
     colours, basis = logs[known], terms[known]
     light = colours @ LUMINANCE
     counts, bounds = np.histogram(light, 96)
-    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), MODE / max(bounds[1] - bounds[0], 1e-9))
+    # Of one tint, the ground is one mode, and a filter wider than the histogram would only take memory.
+    width = min(MODE / max(bounds[1] - bounds[0], 1e-9), len(counts))
+    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), width)
     peak = float(bounds[int(np.argmax(smooth))] + 0.5 * (bounds[1] - bounds[0]))
     middle = np.median(colours[np.abs(light - peak) < MODE], axis=0)
     off = colours - middle
