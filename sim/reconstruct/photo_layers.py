@@ -27,7 +27,8 @@ from .lighting.ground_gloss import GroundGloss, estimate_gloss
 from .lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes, threshold_shadows
 from .reconstruct_options import ReconstructOptions
 from .segmentation.amodal_completion import complete_colours, complete_outline
-from .segmentation.box_segmentation import Box, segment
+from .segmentation.box_crop import Box
+from .segmentation.box_segmentation import segment
 from .segmentation.occlusion_order import Order, occlusion_order
 from .segmentation.plain_backdrop import remnants
 from .shape.body_texture import TexturedSurface

@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 from physgen.sim.composite.inpaint import FillOptions, inpaint
 from physgen.sim.errors import InputError
+from physgen.sim.reconstruct.segmentation.box_crop import crop_around_box
 from physgen.sim.reconstruct.segmentation.box_segmentation import check_distinct, pixel_box, segment
 from physgen.sim.reconstruct.segmentation.ground_shade import without_ground
-from physgen.sim.reconstruct.segmentation.mask_cleanup import (
-    drop_ground_shadow,
-    fill_holes,
-    largest_component,
-    settle_outline,
-)
-from physgen.sim.reconstruct.segmentation.mask_proposals import crop_around_box
+from physgen.sim.reconstruct.segmentation.mask_cleanup import drop_ground_shadow, fill_holes, settle_outline
+from physgen.sim.reconstruct.segmentation.mask_geometry import largest_component
 from scipy import ndimage
 
 WIDTH, HEIGHT = 320, 240

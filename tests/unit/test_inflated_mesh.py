@@ -12,7 +12,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.reconstruct.camera import ground_camera as cameras
-from physgen.sim.reconstruct.segmentation.mask_cleanup import largest_component
+from physgen.sim.reconstruct.segmentation.mask_geometry import largest_component
 from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, textured, world_from_gltf
 from physgen.sim.reconstruct.shape.inflate import covering_balls, inflate, signed_distance
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
-from ..segmentation.mask_cleanup import enclosed_holes
+from ..segmentation.mask_geometry import enclosed_holes
 from .ground_pixels import GroundPixels, ground_pixels, proxy_body
 from .shadow_lamps import fit_light, light_shares
 from .shadow_model import SHADOW_RATIO, light_level_posterior, shadow_probability

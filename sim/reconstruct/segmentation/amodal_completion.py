@@ -21,8 +21,8 @@ from scipy import ndimage
 
 from ...errors import InputError
 from .hidden_legs import with_hidden_legs
+from .mask_geometry import Mask, grown
 
-Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
 
 TILTS = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0)
@@ -333,7 +333,7 @@ def _misfit(outline: Mask, seen: Mask, unknown: Mask) -> float:
 
 def _coincidence(outline: Mask, seen: Mask, unknown: Mask) -> float:
     """Share of the border between ``seen`` and ``unknown`` that ``outline`` makes the object's own edge."""
-    border = seen & (cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    border = seen & grown(unknown)
     if not border.any():
         return 0.0
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))

@@ -16,19 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .mask_cleanup import largest_component
-from .mask_proposals import (
-    EDGE,
-    OBJECT_PARTS,
-    SMOOTHNESS,
-    BoxCrop,
-    edge_strength,
-    graph_cut,
-    learn,
-    principal_contrast,
-)
+from .box_crop import EDGE, BoxCrop, edge_crest, edge_strength
+from .colour_models import OBJECT_PARTS, SMOOTHNESS, graph_cut, learn, principal_contrast
+from .mask_geometry import Mask, grown, hull_of, largest_component
 
-Mask = NDArray[np.bool_]
 Light = NDArray[np.float32]
 
 DARKEST = 0.002
@@ -120,10 +111,10 @@ def _unlike_ground(view: BoxCrop, mask: Mask, *, polished: bool = False) -> tupl
     images, where the ground beside ``mask`` shows some, too."""
     light = _log_light(view.pixels)
     size = float(np.sqrt(mask.sum()))
-    free = ~(cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~view.others
+    free = ~grown(mask, 2) & ~view.others
     ground = _lit_ground(light, free, LOCAL * size)
-    reach = 2 * max(2, round(0.2 * size)) + 1
-    near = (cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & free
+    reach = max(2, round(0.2 * size))
+    near = grown(mask, reach) & free
     # Along the line all channels change at these rates, whose mean is 1.
     rates = 1.0 + _slope(light - ground, near, np.median((ground - ground.mean(axis=2, keepdims=True))[mask], axis=0))
     apart, along = _from_line(light, ground, rates)
@@ -209,7 +200,7 @@ def _cut(view: BoxCrop, mask: Mask, unlike: Light, brighter: Light) -> Mask | No
     cut = mask
     # The second time what the first has given back is no longer among the object's colours.
     for _ in range(2):
-        own = mask & ~(cv2.dilate(ground.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+        own = mask & ~grown(ground)
         if own.sum() < max(50.0, LEAST_OWN * float(mask.sum())) or not ground.any():
             return None
         likely = learn(features[own], OBJECT_PARTS).log_likelihood(features[mask])
@@ -235,9 +226,8 @@ def _rougher(view: BoxCrop, mask: Mask, parts: Mask, labels: NDArray[np.int32]) 
     """The ``labels`` of those of ``parts`` whose fine texture is more than the ground's beside ``mask``, all (h, w)."""
     kernel = np.ones((3, 3), np.uint8)
     light = _log_light(view.pixels)
-    reach = 2 * max(2, round(0.2 * float(np.sqrt(mask.sum())))) + 1
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-    free = ~(cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~view.others
+    near = grown(mask, max(2, round(0.2 * float(np.sqrt(mask.sum())))))
+    free = ~grown(mask, 2) & ~view.others
     beside = cv2.erode((near & free).astype(np.uint8), kernel) > 0
     usual = max(SMOOTH, float(np.quantile(_texture(light, free)[beside], 0.75)) if beside.any() else 0.0)
     own, noise = _texture(light, parts), DARK_SHARE * DARK_NOISE / np.exp(light.mean(axis=2))
@@ -265,7 +255,7 @@ def _brighter_than_beyond(light: Light, part: Mask, mask: Mask, free: Mask, oute
     mixed colours along the outline do not count."""
     kernel = np.ones((3, 3), np.uint8)
     inside = part & (cv2.erode(mask.astype(np.uint8), kernel) > 0)
-    beyond = free & ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    beyond = free & ~grown(mask)
     means, seen = [], outer
     for side in (inside, beyond):
         weight = side.astype(np.float32)
@@ -283,9 +273,7 @@ def _cast_aside(part: Mask, border: Mask, own: Mask) -> bool:
     foot, room = int(rows[-1]), SUNK * len(rows)
     if np.nonzero(part)[0].max() > foot + room or np.nonzero(border)[0].max(initial=0) < foot - room:
         return False
-    hull = np.zeros(part.shape, dtype=np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(body)[:, ::-1].astype(np.int32)), 1)
-    return bool((hull[part] == 0).mean() > ASIDE)
+    return bool((~hull_of(body)[part]).mean() > ASIDE)
 
 
 def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple[Light, Light]) -> Mask:
@@ -293,8 +281,7 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
     nothing of the object ``own``, and that an edge parts from it, no weaker than their edge with the ground. judged:
     see ``_unlike_ground``."""
     unlike, brighter = judged
-    kernel = np.ones((3, 3), np.uint8)
-    crest = cv2.dilate(edge_strength(view.lab), kernel)
+    crest = edge_crest(edge_strength(view.lab))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(parts.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
     pieces, rougher = _pieces(own), _rougher(view, mask, parts, np.asarray(labels, dtype=np.int32))
@@ -305,7 +292,7 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
         part = labels == index
         if np.median(unlike[part]) > MIDDLE:
             continue
-        rim = (cv2.dilate(part.astype(np.uint8), kernel) > 0) & ~part
+        rim = grown(part) & ~part
         if (rim & view.keep).any():
             # What a stroke runs through is the user's.
             continue

@@ -12,22 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .contour_evidence import (
-    APART,
-    CLOSED,
-    CREST,
-    FINE,
-    SEAM,
-    STANDS_OUT,
-    is_shade_of,
-    joined_with,
-    thick_regions,
-)
-from .mask_cleanup import ring_around
-from .mask_proposals import BoxCrop, crop_around_box, edge_strength
+from .box_crop import FINE, crop_around_box, edge_crest, edge_strength, small_copy
+from .mask_geometry import Mask, grown, ring_around
+from .part_contour import CLOSED, STANDS_OUT, PartContour, joined_with, thick_regions
 
-Mask = NDArray[np.bool_]
-
+SEAM = 4
+"""Pixels of the copy between a limb and its end in which their colours are mixed."""
 LEAST, MOST = 0.003, 0.06
 """Area of such a part over the mask's. Feet of a toy had 0.005 to 0.013."""
 WIDTH = 0.04
@@ -51,35 +41,27 @@ def limb_ends(pixels: NDArray[np.uint8], box: tuple[int, int, int, int], mask: M
     pixels: (h, w, 3) sRGB. box: x0, y0, x1, y1 around the object. others: (h, w) what is certainly no part of it. Cost:
     about a second.
     """
-    height, width = mask.shape
-    scale = min(1.0, FINE / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    own, other = (
-        np.asarray(cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0.5
-        for part in (mask, others)
-    )
-    x0, y0, x1, y1 = (round(v * scale) for v in box)
-    view = crop_around_box(small, (x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)), other)
+    copy = small_copy(mask.shape, FINE)
+    own, other = copy.mask(mask), copy.mask(others)
+    view = crop_around_box(copy.pixels(pixels), copy.box(box), other)
     if own.sum() < 400:
         return np.zeros_like(mask)
     regions = thick_regions(view.pixels, max(20, int(0.001 * own.sum())))
-    crest = np.asarray(cv2.dilate(edge_strength(view.lab), np.ones((3, 3), np.uint8)), dtype=np.float32)
-    depth = _depth(own)
+    crest = edge_crest(edge_strength(view.lab))
+    depth, seam = _depth(own), grown(own, SEAM - 1)
     found = np.zeros_like(own)
     for index in np.unique(regions[ring_around(own, SEAM) & view.inside]):
         region = (regions == index) & ~own & ~other
         # What goes on outside of the box is ground.
         if region.any() and not (region & ~view.inside).any():
             part = _largest(region)
-            if _ends_limb(view, part, own, depth, crest):
+            if _ends_limb(PartContour(view, part, seam, crest), own, depth):
                 found |= part
     if not found.any():
         return np.zeros_like(mask)
-    near = cv2.dilate(found.astype(np.uint8), np.ones((2 * SEAM + 1, 2 * SEAM + 1), np.uint8)) > 0
+    near = grown(found, SEAM)
     added = joined_with(own, found) & near & ~own & view.inside
-    large = cv2.resize(added.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-    return np.asarray(large) & ~mask & ~others
+    return copy.enlarged(added) & ~mask & ~others
 
 
 def _largest(region: Mask) -> Mask:
@@ -93,27 +75,15 @@ def _depth(mask: Mask) -> NDArray[np.float32]:
     return np.asarray(inside[1:-1, 1:-1], dtype=np.float32)
 
 
-def _ends_limb(view: BoxCrop, part: Mask, mask: Mask, depth: NDArray[np.float32], crest: NDArray[np.float32]) -> bool:
-    """Whether ``part`` (h, w) is the end of a limb of ``mask``, see the module. depth: of ``mask``; crest: (h, w)."""
-    area, size = float(mask.sum()), float(np.sqrt(mask.sum()))
+def _ends_limb(contour: PartContour, mask: Mask, depth: NDArray[np.float32]) -> bool:
+    """Whether the part is the end of a limb of ``mask`` (h, w), see the module. depth: (h, w) of ``mask``."""
+    part, area = contour.part, float(mask.sum())
     width = 2.0 * float(_depth(part).max())
-    if not LEAST * area <= float(part.sum()) <= MOST * area or width < WIDTH * size:
+    if not LEAST * area <= float(part.sum()) <= MOST * area or width < WIDTH * float(np.sqrt(area)):
         return False
-    near_mask = cv2.dilate(mask.astype(np.uint8), np.ones((2 * SEAM - 1, 2 * SEAM - 1), np.uint8)) > 0
-    rim = ring_around(part, 1)
-    own = rim & ~near_mask
-    if not SHARED[0] < float((rim & near_mask).sum()) / float(rim.sum()) < SHARED[1]:
-        return False
-    if (crest[own] > CREST).mean() <= CLOSED or np.median(crest[own]) <= STANDS_OUT * CREST:
+    if not (SHARED[0] < contour.shared < SHARED[1] and contour.on_edges > CLOSED and contour.sharpness > STANDS_OUT):
         return False
     limb = ring_around(part, round(REACH * (width + SEAM))) & mask
     if not limb.any() or 2.0 * float(depth[limb].max()) >= LIMB * (width + SEAM):
         return False
-    inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    beyond = ring_around(part, 5) & ~ring_around(part, 2) & ~near_mask & ~view.others
-    if inner.sum() < 10 or beyond.sum() < 10:
-        return False
-    colour, outside = np.median(view.lab[inner], axis=0), view.lab[beyond]
-    if (np.linalg.norm(outside - colour, axis=1) < APART).mean() >= ALIKE:
-        return False
-    return not is_shade_of(colour, np.median(outside, axis=0))
+    return contour.going_on < ALIKE and not contour.is_shade

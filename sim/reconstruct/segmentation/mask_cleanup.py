@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from skimage.segmentation import watershed
 
 from ...composite.srgb import cielab
+from .mask_geometry import enclosed_holes, largest_component, shrunk, touching
 
 Mask = NDArray[np.bool_]
 
@@ -32,20 +33,6 @@ PRINT_SHARE = 0.25
 """Largest share of a box that is a print: the opening of a frame is larger."""
 
 
-def largest_component(mask: Mask) -> Mask:
-    """Return the largest 8-connected part of ``mask``; an empty mask stays empty."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    if count <= 1:
-        return mask.copy()
-    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
-
-
-def ring_around(mask: Mask, reach: int) -> Mask:
-    """Return the pixels (h, w) outside of ``mask`` and no farther from it than ``reach`` pixels."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray((cv2.dilate(mask.astype(np.uint8), kernel) > 0) & ~mask)
-
-
 def smooth_outline(mask: Mask, sigma: float | None = None) -> Mask:
     """Return ``mask`` without stair-steps and hairs: Gaussian blur, threshold at one half.
 
@@ -62,13 +49,6 @@ def surrounding_ring(mask: Mask, width: int) -> Mask:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
     binary = mask.astype(np.uint8)
     return np.asarray((cv2.dilate(binary, kernel) > 0) & ~mask & ~enclosed_holes(mask))
-
-
-def enclosed_holes(mask: Mask) -> Mask:
-    """Return background that is not connected to the image border (4-connected)."""
-    padded = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
-    _, labels = cv2.connectedComponents(padded, connectivity=4)
-    return np.asarray((labels != labels[0, 0]) & (padded > 0))[1:-1, 1:-1]
 
 
 def fill_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
@@ -105,7 +85,7 @@ def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
     area = int(mask.sum())
     lab = cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 1.0), dtype=np.uint8))
     ring = surrounding_ring(mask, max(4, round(0.12 * np.sqrt(area))))
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    inner = shrunk(mask, 2)
     near, inside = lab[ring], lab[inner]
     if len(near) < 50 or len(inside) < 50:
         return mask.copy()
@@ -170,7 +150,7 @@ def _as_beside(lab: NDArray[np.float32], region: Mask, ring: Mask) -> bool:
     A pale dial or a clay's side is like some ground somewhere near; what shows through goes on in the same rows. Rows
     without background beside them say nothing.
     """
-    middle = cv2.erode(region.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    middle = shrunk(region, 2)
     if middle.sum() < 20:
         middle = region
     apart = []
@@ -250,10 +230,3 @@ def drop_ground_shadow(pixels: NDArray[np.uint8], mask: Mask, *, most: float = 0
     cleaned = largest_component(mask & ~shadow)
     removed = area - int(cleaned.sum())
     return cleaned if 0 < removed <= most * area else mask.copy()
-
-
-def touching(parts: Mask, target: Mask) -> Mask:
-    """Return the 8-connected components of ``parts`` that overlap ``target``."""
-    _, labels = cv2.connectedComponents(parts.astype(np.uint8), connectivity=8)
-    reached = np.unique(labels[target & parts])
-    return np.asarray(np.isin(labels, reached[reached > 0]))

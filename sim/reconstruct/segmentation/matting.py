@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ...composite.srgb import bytes_to_linear, cielab, linear_to_bytes
-from .mask_cleanup import touching
-from .mask_proposals import LIMIT, crop_around_box, graph_cut, ground_likelihood, learn, principal_contrast
+from .box_crop import crop_around_box
+from .colour_models import LIMIT, graph_cut, ground_likelihood, learn, principal_contrast
+from .mask_geometry import grown, touching
 
 Mask = NDArray[np.bool_]
 Alpha = NDArray[np.float32]
@@ -90,7 +91,7 @@ def _solved(colours: NDArray[np.float64], unknown: Mask, known: Alpha) -> Alpha:
     height, width = unknown.shape
     if min(height, width) < 3:
         return np.where(unknown, np.float32(0.5), known)
-    near = cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    near = grown(unknown)
     near[0], near[-1], near[:, 0], near[:, -1] = False, False, False, False
     centres = np.flatnonzero(near)
     offsets = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()

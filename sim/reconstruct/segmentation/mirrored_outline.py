@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from .contour_evidence import CREST
-from .mask_cleanup import enclosed_holes
-from .mask_proposals import BoxCrop, crop_around_box, edge_strength, ground_likelihood
+from .box_crop import BoxCrop, crop_around_box, edge_crest, edge_strength, small_copy
+from .colour_models import ground_likelihood
+from .mask_geometry import Mask, enclosed_holes, grown, shrunk
+from .part_contour import CREST
 
-Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]
 
@@ -81,16 +81,9 @@ def mirrored_outline(
     pixels: (h, w, 3) sRGB. box: x0, y0, x1, y1 around the object. others: (h, w) other objects, drop: (h, w) what the
     user says is background. Cost: some tenths of a second.
     """
-    height, width = mask.shape
-    scale = min(1.0, SIZE / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    own, other, barred = (
-        np.asarray(cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0.5
-        for part in (mask, others, drop)
-    )
-    x0, y0, x1, y1 = (round(v * scale) for v in box)
-    view = crop_around_box(small, (x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)), other, drop=barred)
+    copy = small_copy(mask.shape, SIZE)
+    own, other, barred = copy.mask(mask), copy.mask(others), copy.mask(drop)
+    view = crop_around_box(copy.pixels(pixels), copy.box(box), other, drop=barred)
     if own.sum() < 400 or view.outside.sum() < 200:
         return mask
     edges = edge_strength(view.lab)
@@ -110,10 +103,7 @@ def mirrored_outline(
     added = cv2.morphologyEx((outline & ~own).astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
     outline = (outline & own) | added
     kept = np.asarray((reach < SLIVER[0]) | (reach > SLIVER[1] * float(np.sqrt(own.sum()))))[labels] & (labels > 0)
-    whole, gone = (
-        cv2.resize(part.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-        for part in (outline | kept, own & ~(outline | kept))
-    )
+    whole, gone = copy.enlarged(outline | kept), copy.enlarged(own & ~(outline | kept))
     return np.asarray((mask & ~gone) | (whole & ~others & ~drop))
 
 
@@ -165,7 +155,7 @@ def _axis_of(mask: Mask, edges: Field) -> _Axis:
 
 def _path(view: BoxCrop, mask: Mask, edges: Field, axis: _Axis) -> tuple[Mask, float]:
     """The symmetric outline of least cost, filled (h, w), and its share on edges of both sides."""
-    crest = np.asarray(cv2.dilate(edges, np.ones((3, 3), np.uint8)), dtype=np.float32)
+    crest = edge_crest(edges)
     size = float(np.sqrt(mask.sum()))
     rows = np.flatnonzero(mask.any(axis=1))
     tall = max(1.0, float(rows[-1] - rows[0]) / 2.0)
@@ -234,19 +224,17 @@ def _cheapest(places: Points, strength: Field, node: Points) -> NDArray[np.int64
 def _adds(outline: Mask, mask: Mask, edges: Field, axis: _Axis) -> bool:
     """Whether what ``outline`` adds to ``mask``, both (h, w), is mostly closed by edges of both sides that stand out
     from those beyond."""
-    kernel = np.ones((3, 3), np.uint8)
-    crest = np.asarray(cv2.dilate(edges, kernel), dtype=np.float32)
+    crest = edge_crest(edges)
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
     folded = np.minimum(crest, _at(crest, 2.0 * axis.column(rows) - columns, rows))
     either = mask | _mirrored(mask, axis)
-    rim = outline & ~(cv2.erode(outline.astype(np.uint8), kernel, borderValue=0) > 0)
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    rim = outline & ~shrunk(outline)
+    near = grown(mask, 2)
     size, foot = float(np.sqrt(mask.sum())), int(np.flatnonzero(mask.any(axis=1))[-1])
     tall = float(np.ptp(np.flatnonzero(mask.any(axis=1))))
 
     def around(part: Mask, reach: float) -> Mask:
-        side = 2 * max(1, round(reach)) + 1
-        return np.asarray(cv2.dilate(part.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+        return grown(part, max(1, round(reach)))
 
     beyond = around(outline, 0.08 * size) & ~around(outline | mask, 3)
     labels, count = ndimage.label(outline & ~mask & ~enclosed_holes(mask), np.ones((3, 3)))
@@ -259,7 +247,7 @@ def _adds(outline: Mask, mask: Mask, edges: Field, axis: _Axis) -> bool:
         area = float((part & ~near).sum())
         added += area
         outer = part & rim & ~near
-        inner = cv2.erode(part.astype(np.uint8), kernel, borderValue=0) > 0
+        inner = shrunk(part)
         if not outer.any() or (part & rim).sum() < MOUTH * (part & ~inner).sum():
             continue
         texture = beyond & around(part, 0.1 * size)

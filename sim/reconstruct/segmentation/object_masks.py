@@ -25,9 +25,9 @@ from ..adapters.resolve import resolve
 from ..photo import Photo
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..stage_cache import Arrays, Notice, StageCache, Steps
-from .box_segmentation import Box, check_distinct, pixel_box, segment
-from .mask_cleanup import touching
-from .mask_proposals import largest_part
+from .box_crop import Box
+from .box_segmentation import check_distinct, pixel_box, segment
+from .mask_geometry import extent_of, grown, largest_part, touching
 from .matting import refine_alpha
 from .strokes import Strokes, drawn_strokes, require_apart
 
@@ -88,9 +88,9 @@ def _painted_over(pixels: Pixels, box: Box, others: Mask) -> Pixels:
     filled = cv2.resize(
         cv2.inpaint(small, hole, 3, cv2.INPAINT_TELEA), taken.shape[::-1], interpolation=cv2.INTER_LINEAR
     )
-    grown = cv2.dilate(taken.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    near = grown(taken, 2)
     result = pixels.copy()
-    result[window][grown] = filled[grown]
+    result[window][near] = filled[near]
     return result
 
 
@@ -192,7 +192,7 @@ def segment_objects(
     size = (picture.width, picture.height)
     given = {i: read_mask(item.mask, *size) for i, item in enumerate(objects) if item.mask is not None}
     boxes = [
-        _box_of(given[i]) if item.box is None else pixel_box(item.box, picture.scale, *size, name)
+        extent_of(given[i]) if item.box is None else pixel_box(item.box, picture.scale, *size, name)
         for i, (item, name) in enumerate(zip(objects, names, strict=True))
     ]
     strokes = [drawn_strokes(item, picture, box, steps.notice) for item, box in zip(objects, boxes, strict=True)]
@@ -285,11 +285,6 @@ def _cut_out(
 ) -> Arrays:
     found = model_mask(soft, pixels, box, name, others, notice, strokes=strokes)
     return {"mask": np.zeros(pixels.shape[:2], dtype=bool) if found is None else found}
-
-
-def _box_of(mask: Mask) -> Box:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def _corners(boxes: Sequence[Box], wanted: Sequence[int]) -> NDArray[np.float64]:

@@ -21,25 +21,24 @@ from skimage.segmentation import felzenszwalb, slic
 from ...composite.srgb import cielab
 from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
-from .mask_cleanup import largest_component
-from .mask_proposals import crop_around_box, edge_strength, ground_like, ground_likelihood, largest_part
+from .box_crop import crop_around_box, edge_strength
+from .colour_models import ground_likelihood
+from .mask_geometry import Mask, extent_of, largest_component, largest_part, solidity_of
+from .mask_proposals import ground_like
 from .mask_proposals import proposals as mask_proposals
 from .mask_proposals import score as objectness
 from .outline_sharpness import FINE, in_focus, sharp_as
 from .plain_backdrop import FULL, things_before_backdrop
 from .proposal_features import (
     FEATURES,
-    Mask,
     at_size_of,
     contrast_of,
     copy_of,
     cut_share,
-    extent_of,
     features_of,
     lines_go_on,
     score_of,
     share_on_edges,
-    solidity_of,
 )
 from .round_things import round_things
 from .whole_objects import CUT, Candidate, stacked_parts, whole_objects

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...composite.srgb import cielab
-from .mask_cleanup import touching
-from .mask_proposals import edge_strength
+from .box_crop import edge_crest, edge_strength, small_copy
+from .mask_geometry import Mask, grown, touching
 
-Mask = NDArray[np.bool_]
 Values = NDArray[np.float32]
 
 SIDE = 900
@@ -53,22 +52,16 @@ def outer_rim(pixels: NDArray[np.uint8], mask: Mask, closed: Mask) -> Mask:
 
     closed: (H, W) pixels that may not belong to it. It touches the mask.
     """
-    height, width = mask.shape
-    scale = min(1.0, SIDE / max(height, width))
     nothing = np.zeros_like(mask)
     if not mask.any():
         return nothing
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    own, barred = (
-        cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for part in (mask, closed)
-    )
-    found = _rim(small, own, barred)
+    copy = small_copy(mask.shape, SIDE)
+    found = _rim(copy.pixels(pixels), copy.mask(mask), copy.mask(closed))
     if not found.any():
         return nothing
-    whole = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    whole = copy.enlarged(found)
     # Pixels where the colours of rim and object mix are unlike both.
-    seam = 2 * max(1, round(1.5 / scale)) + 1
+    seam = 2 * max(1, round(1.5 / copy.scale)) + 1
     joined = cv2.morphologyEx((whole | mask).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((seam, seam), np.uint8)) > 0
     return np.asarray(joined & ~mask & ~closed & (cv2.dilate(whole.astype(np.uint8), np.ones((seam, seam))) > 0))
 
@@ -88,7 +81,7 @@ def _rim(pixels: NDArray[np.uint8], mask: Mask, barred: Mask) -> Mask:
     side = round(least)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     candidates = cv2.morphologyEx((band & (apart > UNLIKE)).astype(np.uint8), cv2.MORPH_OPEN, disc)
-    sharp = np.asarray(cv2.dilate(edge_strength(lab), np.ones((3, 3), np.uint8))) > SHARP
+    sharp = edge_crest(edge_strength(lab)) > SHARP
     _, labels = cv2.connectedComponents(candidates, connectivity=8)
     rim = nothing.copy()
     for index, window in enumerate(ndimage.find_objects(labels), start=1):
@@ -138,7 +131,7 @@ def _apart(lab: Values, away: Values, covered: Mask, band: Mask, reach: float) -
 
 def _ends(part: Mask, away: Values, sharp: Mask, reach: float) -> bool:
     """Whether ``part`` (h, w) ends within ``reach``, at an edge."""
-    rim = (cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~part
+    rim = grown(part) & ~part
     depth = float(np.median(away[part]))
     outer = rim & (away > depth)
     if not outer.any() or (away[outer] > reach - 1.0).mean() > 0.1:

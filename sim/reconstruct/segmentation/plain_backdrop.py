@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ...composite.srgb import cielab
 from ..reconstruct_options import Proposal
-from .mask_cleanup import touching
-from .mask_proposals import edge_strength
+from .box_crop import edge_strength
+from .mask_geometry import grown, touching
 from .outline_sharpness import in_focus
 
 Mask = NDArray[np.bool_]
@@ -204,7 +204,7 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     added = joined & ~own & ~shade & (cv2.dilate(kept.astype(np.uint8), _disc(SEAM)) > 0) & (~backdrop | kept)
     full = cv2.resize(added.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
     reach = round(SEAM * max(across, down)) + 1
-    beside = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    beside = grown(mask, reach)
     return np.asarray((full | (beside & _thin_between(mask, full, reach))) & ~mask & within)
 
 

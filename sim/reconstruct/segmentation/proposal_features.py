@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .mask_cleanup import ring_around
+from .box_crop import edge_crest
+from .mask_geometry import Mask, extent_of, grown, outline_of, ring_around, shrunk, solidity_of
 
-Mask = NDArray[np.bool_]
 FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
 """Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
 its outline on the photo's border; IoU of the candidate with what its box yields; height of its middle in the photo;
@@ -46,7 +46,7 @@ def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
     but light and prints lie on what has them."""
     kernel = np.ones((5, 5), np.uint8)
     inside = cv2.erode(mask.astype(np.uint8), kernel) > 0
-    outside = ~(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    outside = ~grown(mask, 2)
     size, height, width = float(np.sqrt(mask.sum())), *mask.shape
     least = max(LEAST_ACROSS_PX, ACROSS * size)
     counts = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1]).astype(int)
@@ -60,12 +60,6 @@ def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
         if shorter >= least:
             across.append(shorter)
     return len(across) >= LINES_ACROSS and sum(across) > ALL_ACROSS * size
-
-
-def extent_of(mask: Mask) -> tuple[int, int, int, int]:
-    """Return the box x0, y0, x1, y1 of ``mask`` (H, W), the last pixel exclusive."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def features_of(
@@ -103,17 +97,11 @@ def contrast_of(mask: Mask, lab: NDArray[np.float32]) -> float:
     return float(np.linalg.norm(lab[mask].mean(axis=0) - lab[around].mean(axis=0)))
 
 
-def _outline(mask: Mask) -> Mask:
-    binary = mask.astype(np.uint8)
-    kernel = np.ones((3, 3), np.uint8)
-    return np.asarray((cv2.dilate(binary, kernel) > 0) & ~(cv2.erode(binary, kernel, borderValue=0) > 0))
-
-
 def share_on_edges(mask: Mask, edges: NDArray[np.float32]) -> float:
     """Return the share of the outline of ``mask`` that lies on ``edges``."""
-    outline = _outline(mask)
+    outline = outline_of(mask)
     # An outline may be a pixel beside its edge.
-    crest = cv2.dilate(edges, np.ones((3, 3), np.uint8))
+    crest = edge_crest(edges)
     return float((crest[outline] > 2.5).mean()) if outline.any() else 0.0
 
 
@@ -124,23 +112,11 @@ def cut_share(mask: Mask) -> float:
     return min(1.0, touching / float(x1 - x0 + y1 - y0))
 
 
-def solidity_of(mask: Mask) -> float:
-    """Return the share of its convex hull that ``mask`` fills."""
-    return float(mask.sum()) / max(1.0, float(hull_of(mask).sum()))
-
-
-def hull_of(mask: Mask) -> Mask:
-    """Return the convex hull (H, W) of ``mask``."""
-    hull = np.zeros(mask.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32)), 1)
-    return hull > 0
-
-
 def _is_like_shade(mask: Mask, lab: NDArray[np.float32]) -> bool:
     """Whether ``mask`` may be nothing but shade: darker than the ring around it, of its hue, and as even."""
     size = float(np.sqrt(mask.sum()))
     around = ring_around(mask, max(4, round(0.2 * size)))
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    inner = shrunk(mask)
     if around.sum() < 20 or inner.sum() < 20:
         return False
     own, near = np.median(lab[inner], axis=0), np.median(lab[around], axis=0)

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .proposal_features import Mask, cut_share, extent_of, hull_of, solidity_of
+from .mask_geometry import Mask, extent_of, hull_of, solidity_of
+from .proposal_features import cut_share
 
 GOOD = 0.8
 """Score of a candidate that may be an object of a group."""
