@@ -92,8 +92,9 @@ def readable(name: str) -> str:
 
 
 def count(number: int, what: str) -> str:
-    """Return ``1 object``, ``2 objects``."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    """Return ``1 object``, ``2 objects``, ``2 boxes``."""
+    plural = f"{what}es" if what.endswith("x") else f"{what}s"
+    return f"{number} {what if number == 1 else plural}"
 
 
 PRESSURE = {

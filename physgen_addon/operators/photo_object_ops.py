@@ -25,7 +25,7 @@ from ..photo.photo_image import PhotoTool, on_screen, place_under, shows_photo
 from ..photo.photo_maths import box_overlap, simplified
 from ..photo.photo_request import photo_file, scene_folder
 from ..props.preferences import python
-from ..text import report_errors
+from ..text import count, report_errors
 from .mask_horizon_ops import chosen_box
 from .photo_ops import add_box
 
@@ -94,7 +94,8 @@ class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
             found.append(Proposal((x0, y0, x1, y1), float(item["score"])))
         added = add_found(scene, found, every=self.every)
         redraw("IMAGE_EDITOR")
-        return f"{len(found)} objects found, {added} boxes added; {Path(str(final['out'])).name} has a numbered picture"
+        words = f"{count(len(found), 'object')} found, {count(added, 'box')} added"
+        return f"{words}; {Path(str(final['out'])).name} has a numbered picture"
 
 
 DIM = 0.2

@@ -195,7 +195,11 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw everything from photo to scene."""
     state = context.scene.physgen_photo
     column = layout.column(align=True)
-    column.operator(PHYSGEN_OT_open_photo.bl_idname, text="Open Photo" if state.image is None else state.image.name)
+    column.operator(
+        PHYSGEN_OT_open_photo.bl_idname,
+        text="Open Photo" if state.image is None else state.image.name,
+        icon="FILE_FOLDER",
+    )
     editor = context.space_data.type == "IMAGE_EDITOR"
     if editor and context.space_data.image not in (None, state.image):
         column.operator(PHYSGEN_OT_use_image.bl_idname, icon="IMAGE_DATA")
@@ -209,6 +213,17 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     _draw_boxes(layout, context, state)
     if 0 <= state.box_index < len(state.boxes):
         draw_details(layout, context, state.boxes[state.box_index])
+    # What comes next is in sight, and what few need below it.
+    layout.prop(state, "default_motion")
+    row = layout.row()
+    row.scale_y = 1.4
+    again = made_folder(state) is not None
+    row.operator(
+        PHYSGEN_OT_reconstruct.bl_idname, text="Reconstruct Again" if again else "Reconstruct", icon="MESH_MONKEY"
+    )
+    if again:
+        text.sentences(layout, context, "Only affected stages run again; your physics edits are kept.")
+    draw_job(layout, context, *JOBS)
     draw_cutouts(layout, context, state)
     draw_models(layout, state)
     draw_camera(layout, context, state)
@@ -220,31 +235,23 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
             text.sentences(layout, context, f"Makes {scene_folder(state).name} beside the {_beside()}.")
         except PhysGenError as error:
             text.sentences(layout, context, str(error), icon="ERROR")
-    layout.prop(state, "default_motion")
-    row = layout.row()
-    row.scale_y = 1.4
-    again = made_folder(state) is not None
-    row.operator(
-        PHYSGEN_OT_reconstruct.bl_idname, text="Reconstruct Again" if again else "Reconstruct", icon="MESH_MONKEY"
-    )
-    if again:
-        text.sentences(layout, context, "Only affected stages run again; your physics edits are kept.")
-    draw_job(layout, context, *JOBS)
 
 
 def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
+    if state.boxes:
+        row = layout.row()
+        row.template_list("PHYSGEN_UL_boxes", "", state, "boxes", state, "box_index", rows=3)
+        buttons = row.column(align=True)
+        buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
+        buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
+    else:
+        text.sentences(layout, context, "Draw a box around each object that is to move.")
     row = layout.row()
-    row.template_list("PHYSGEN_UL_boxes", "", state, "boxes", state, "box_index", rows=3)
-    buttons = row.column(align=True)
-    buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
-    buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
-    layout.operator(PHYSGEN_OT_draw_box.bl_idname, icon="SELECT_SET")
+    row.scale_y = 1.0 if state.boxes else 1.4
+    row.operator(PHYSGEN_OT_draw_box.bl_idname, icon="SELECT_SET")
     row = layout.row(align=True)
     row.operator(PHYSGEN_OT_find_objects.bl_idname, icon="VIEWZOOM").every = False
     row.operator(PHYSGEN_OT_find_objects.bl_idname, text="All").every = True
-    if not state.boxes:
-        text.sentences(layout, context, "Draw a box around each object that is to move.")
-        return
     if not 0 <= state.box_index < len(state.boxes):
         return
     box = state.boxes[state.box_index]
@@ -252,7 +259,7 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     column.use_property_split, column.use_property_decorate = True, False
     optional(column, box, "knows_size", "size_m", "Size", otherwise="Estimated")
     if not any(other.size_m > 0 for other in state.boxes):
-        text.sentences(layout, context, "Set the size of one object; otherwise the scale is estimated.")
+        text.sentences(layout, context, "Tick Size and enter it for one object; otherwise the scale is estimated.")
 
 
 def _beside() -> str:

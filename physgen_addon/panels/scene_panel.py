@@ -15,6 +15,7 @@ from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
 from ..operators.photo_object_ops import PHYSGEN_OT_show_cutouts
 from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, image_here
+from ..operators.render_ops import PHYSGEN_OT_render_video
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
@@ -58,7 +59,7 @@ class PHYSGEN_PT_scene(Sidebar, bpy.types.Panel):
 
 
 def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw what must be seen however long the panels below are: progress, that no Python simulates, or Bake."""
+    """Draw what must be seen however long the panels below are: progress, that no Python simulates, Bake, or Play."""
     job, scene = running(), context.scene
     if job is None:
         found = bake_state.state(scene)
@@ -68,8 +69,11 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
             pass
         elif found.status == "baked" and not found.trouble:
             text.sentences(layout, context, f"Baked: {text.count(found.frames_done, 'frame')}", icon="CHECKMARK")
+            _draw_baked(layout, context)
         elif any(item.physgen.role == "dynamic" for item in bodies(scene)):
             draw_bake_button(layout, found.status)
+            if found.status == "stale":
+                text.sentences(layout, context, found.advice, icon="ERROR")
         return
     shows_photo = not context.scene.physgen.folder and context.scene.physgen_photo.image is not None
     if shows_photo and job.title in photo_panel.JOBS:
@@ -78,7 +82,18 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row = draw_progress(layout, context, job)
     if bake_state.bake_job(context.scene) is not None:
         row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="", icon="PAUSE")
-    row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+    else:
+        row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="", icon="X")
+
+
+def _draw_baked(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw what comes after a bake: to play it, and to render it into the photo."""
+    row = layout.row(align=True)
+    row.scale_y = 1.4
+    plays = context.screen is not None and context.screen.is_animation_playing
+    row.operator("screen.animation_play", text="Stop" if plays else "Play", icon="PAUSE" if plays else "PLAY")
+    if context.scene.physgen.folder:
+        row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -46,7 +46,7 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
     """
     locked = is_baking(context.scene)
     if locked and why:
-        text.sentences(layout, context, "Locked while baking. Pause or cancel the bake to edit.", icon="LOCKED")
+        text.sentences(layout, context, "Locked while baking. Pause the bake to edit.", icon="LOCKED")
     column = layout.column()
     column.use_property_split, column.use_property_decorate = True, False
     column.enabled = not locked

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from .. import text
-from ..background_jobs import PHYSGEN_OT_cancel_job, running
+from ..background_jobs import running
 from ..bake_state import BakeState, shows, state
 from ..operators.bake_ops import (
     PHYSGEN_OT_bake,
@@ -97,9 +97,7 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context, found: Ba
             text.sentences(layout, context, found.message, icon="INFO")
             return
         draw_progress(layout, context, job)
-        row = layout.row(align=True)
-        row.operator(PHYSGEN_OT_pause_bake.bl_idname, text="Pause", icon="PAUSE")
-        row.operator(PHYSGEN_OT_cancel_job.bl_idname, text="Cancel", icon="CANCEL")
+        layout.operator(PHYSGEN_OT_pause_bake.bl_idname, icon="PAUSE")
         return
     other = running()
     if other is not None:

@@ -29,8 +29,10 @@ _UPRIGHT, _ORIENTATION = 1, 0x0112
 def load_photo_image(path: Path) -> tuple[bpy.types.Image, tuple[int, int]]:
     """Return the photo at ``path`` upright, and its width and height in pixels.
 
-    Raises InputError if it is missing, of another type, or unreadable; then no image is left behind.
+    Raises InputError if it is missing, a folder, of another type, or unreadable; then no image is left behind.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; choose a photo in it")
     if not path.is_file():
         raise InputError(f"{path}: there is no such photo; check its name")
     if path.suffix.lower() not in SUFFIXES:

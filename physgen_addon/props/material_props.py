@@ -93,8 +93,9 @@ def preset_title(name: str) -> str:
 
 
 def shipped_items() -> list[tuple[str, str, str]]:
-    """Return the shipped presets as entries of a menu, by name."""
-    return [(name, preset_title(name), _SHIPPED.descriptions[name]) for name in _SHIPPED.good]
+    """Return the shipped presets as entries of a menu, in the order of their titles."""
+    names = sorted(_SHIPPED.good, key=preset_title)
+    return [(name, preset_title(name), _SHIPPED.descriptions[name]) for name in names]
 
 
 def own_title(likeness: str) -> str:

@@ -36,6 +36,17 @@ def _models(stage: str, first: tuple[str, str, str]) -> list[tuple[str, str, str
     return [first, *((m.name, m.title, f"Installed by: physgen models install {m.name}") for m in known)]
 
 
+def _preset_items() -> list[tuple[str, str, str, str, int]]:
+    """Return the entries of a box's material, in the order of their titles.
+
+    A .blend stores an entry's number: 0, and the places of the presets' own names in alphabetical order.
+    """
+    shipped = shipped_items()
+    numbers = {name: place for place, name in enumerate(sorted(item[0] for item in shipped), start=1)}
+    automatic = ("auto", "Automatic", "By what it is", "NONE", 0)
+    return [automatic, *((*item, "NONE", numbers[item[0]]) for item in shipped)]
+
+
 def _on_box(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
     # The image editors draw the boxes.
     redraw("IMAGE_EDITOR")
@@ -96,7 +107,7 @@ class PHYSGEN_PG_photo_box(bpy.types.PropertyGroup):
     preset: EnumProperty(
         name="Material",
         description="Material of the reconstructed object; it can be changed afterwards, too",
-        items=[("auto", "Automatic", "By what it is"), *shipped_items()],
+        items=_preset_items(),
     )
     shape: from_field(
         ObjectRequest,

@@ -95,7 +95,7 @@ def propose(
         for item in seen
     )
     if not found:
-        raise InputError(f"{photo}: no object stands out in it; draw a box around each one: --box x0,y0,x1,y1")
+        raise InputError(f"{photo}: no object stands out in it; draw a box around each one (--box x0,y0,x1,y1)")
     steps.finish()
     if out is not None:
         boxes = [tuple(v * picture.scale for v in item.box) for item in found]

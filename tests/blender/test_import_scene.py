@@ -447,6 +447,8 @@ def test_other_files_than_photos_are_refused(tmp_path):
             bpy.ops.physgen.open_photo(filepath=str(tmp_path / name))
     with pytest.raises(RuntimeError, match="there is no such photo"):
         bpy.ops.physgen.open_photo(filepath=str(tmp_path / "b.png"))
+    with pytest.raises(RuntimeError, match="is a folder; choose a photo in it"):
+        bpy.ops.physgen.open_photo(filepath=str(tmp_path))
     assert not bpy.data.images
 
 

@@ -219,3 +219,16 @@ def test_recognised_numbers_are_called_by_what_they_are_like():
     assert names["custom"] == "Like Plastic (hard)"
     import_physics.fill_material(material, material_props.find_preset("wood"))
     assert (material.preset, material.likeness) == ("wood", "")
+
+
+def test_materials_are_in_the_order_of_their_titles():
+    """A menu in the order of hidden names has Plastic (hard) between Foam and Honey."""
+    titles = [title for _, title, _ in material_props.shipped_items()]
+    assert titles == sorted(titles) and "Plastic (hard)" in titles
+    box = bpy.context.scene.physgen_photo.boxes.add()
+    choices = box.bl_rna.properties["preset"].enum_items
+    assert [item.name for item in choices] == ["Automatic", *titles]
+    # Files have the numbers, which follow the names.
+    assert [item.identifier for item in sorted(choices, key=lambda item: item.value)[1:]] == sorted(
+        item[0] for item in material_props.shipped_items()
+    )

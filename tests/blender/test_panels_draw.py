@@ -158,6 +158,49 @@ def test_bake_is_in_the_first_panel_until_it_is_done():
     assert layout.words == ["Bake Again"]
 
 
+def scene_panel(monkeypatch, status, advice=""):
+    """What the first panel draws where the bake of the scene is in that state, in words and names."""
+    found = bake_state.BakeState(status=status, frames_done=48, frames=48, advice=advice)
+    monkeypatch.setattr(bake_state, "state", lambda scene: found)
+    return draw_all("PT_scene")["PHYSGEN_PT_scene"]
+
+
+def test_the_first_panel_says_what_comes_after_a_bake(monkeypatch, tmp_path):
+    a_body()
+    shown = scene_panel(monkeypatch, "baked")
+    assert "screen.animation_play" in shown.names and "physgen.render_video" not in shown.names
+    bpy.context.scene.physgen.folder = str(tmp_path)
+    assert "physgen.render_video" in scene_panel(monkeypatch, "baked").names
+    shown = scene_panel(monkeypatch, "stale", bake_state.MESSAGES["stale"])
+    assert "Bake Again" in shown.words and "Out of date" in " ".join(shown.words)
+    assert "screen.animation_play" not in shown.names
+
+
+def test_a_bake_is_paused_and_other_jobs_are_cancelled():
+    """Both would do the same to a bake."""
+    a_body()
+    go_on = threading.Event()
+    for operator, button in ((bake_state.BAKE_OPERATOR, "pause_bake"), ("physgen.compose_objects", "cancel_job")):
+        job = background_jobs.Job(
+            "Bake",
+            lambda on_event, cancelled: go_on.wait(60) and {"event": "done"},
+            operator=operator,
+            scene=bpy.context.scene.session_uid,
+        )
+        background_jobs._running.append(job)
+        job.start()
+        try:
+            stops = {name for name in draw_all("PT_scene")["PHYSGEN_PT_scene"].names if name in STOPS}
+        finally:
+            go_on.set()
+            job.wait()
+            background_jobs._running.clear()
+        assert stops == {f"physgen.{button}"}
+
+
+STOPS = ("physgen.pause_bake", "physgen.cancel_job")
+
+
 def test_what_counts_instead_of_a_number_that_is_off_is_said():
     rendering = bpy.context.scene.physgen.rendering
     for own, words in ((False, ["Automatic"]), (True, [])):
@@ -257,8 +300,13 @@ def test_alternatives_are_said_once(verdict, is_said):
 def test_a_photo_is_drawn_with_its_boxes():
     bpy.ops.physgen.open_photo(filepath=str(COFFEE))
     photo = bpy.context.scene.physgen_photo
+    empty = draw_all("PT_scene")["PHYSGEN_PT_scene"].names
+    assert "physgen.draw_box" in empty and "PHYSGEN_UL_boxes" not in empty
     for name in ("ball", "cup"):
         photo.boxes.add().name = name
+    names = draw_all("PT_scene")["PHYSGEN_PT_scene"].names
+    # What comes next is above what few need.
+    assert names.index("PHYSGEN_UL_boxes") < names.index("physgen.reconstruct") < names.index("output")
     assert len(draw_every_choice(photo)) > 5
 
 
