@@ -15,6 +15,7 @@ from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, cho
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.camera.vanishing_points import straight_lines
 from physgen.sim.reconstruct.reconstruct_options import Proposal
+from physgen.sim.reconstruct.segmentation.border_ownership import lightness_of, lines_go_on, sides_go_on
 from physgen.sim.reconstruct.segmentation.object_proposals import (
     LEFT_ASIDE,
     candidates,
@@ -24,7 +25,6 @@ from physgen.sim.reconstruct.segmentation.object_proposals import (
     with_the_rest_aside,
 )
 from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width, sharp_as
-from physgen.sim.reconstruct.segmentation.proposal_features import lines_go_on
 from PIL import Image
 from scipy import ndimage
 
@@ -343,6 +343,47 @@ def test_lines_go_on_through_a_patch_of_light_but_not_through_a_thing():
     assert not lines_go_on(thing, lines)
     # A single line may end behind a thing and begin again beside it by chance.
     assert not lines_go_on(sunny, lines[:0])
+
+
+def bench(seed=0):
+    """A seat and a back of one colour with grass between them (300 x 400), the grass (h, w), and a grid of rows and
+    columns: the slats' edges, which slope a little, go on before a post on either side."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:300, :400] + 0.5
+    noise = rng.normal(scale=3.0, size=(300, 400, 1))
+    picture = np.full((300, 400, 3), (60.0, 140.0, 110.0)) + noise
+    between = (rows > 90 + 0.08 * columns) & (rows < 150 + 0.08 * columns)
+    picture[between] = (45.0, 110.0, 85.0)
+    gap = between & (columns > 70) & (columns < 330)
+    grass = ndimage.gaussian_filter(rng.normal(size=(300, 400)), 1.0) * 60
+    picture[gap] = (np.array([120.0, 130.0, 60.0]) + grass[..., None])[gap]
+    return picture, gap, rows, columns
+
+
+def test_a_gap_of_a_bench_lies_behind_its_slats_and_a_thing_on_it_does_not():
+    """Grass between the slats of a bench flew beside a shoe."""
+    picture, gap, rows, columns = bench()
+    box = (np.abs(columns - 200) < 60) & (np.abs(rows - 220) < 50)
+    picture[box] = (190.0, 90.0, 60.0)
+    lightness = lightness_of(np.clip(picture, 0, 255).astype(np.uint8))
+    assert sides_go_on(gap, lightness)
+    assert not sides_go_on(box, lightness)
+
+
+def test_a_thing_that_ends_at_one_line_owns_its_outline():
+    """A book's upper edge may lie in line with the far edge of its table."""
+    picture, _, rows, columns = bench()
+    picture[:] = np.where((rows < 120.0)[..., None], (200.0, 195.0, 190.0), (120.0, 90.0, 60.0))
+    book = (np.abs(columns - 200) < 60) & (rows > 120) & (rows < 240)
+    picture[book] = (50.0, 60.0, 150.0)
+    assert not sides_go_on(book, lightness_of(np.clip(picture, 0, 255).astype(np.uint8)))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (8, 8), (9, 400), (400, 9)])
+def test_plain_pictures_have_no_sides_that_go_on(shape):
+    plain = lightness_of(np.full((*shape, 3), 90, np.uint8))
+    assert not sides_go_on(np.ones(shape, bool), plain)
+    assert not sides_go_on(np.zeros(shape, bool), plain)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (8, 8), (9, 400)])

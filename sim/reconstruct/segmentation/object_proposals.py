@@ -21,6 +21,7 @@ from skimage.segmentation import felzenszwalb, slic
 from ...composite.srgb import cielab
 from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
+from .border_ownership import lightness_of, lines_go_on, sides_go_on
 from .box_crop import crop_around_box, edge_strength
 from .colour_models import ground_likelihood
 from .mask_geometry import Mask, extent_of, largest_component, largest_part, solidity_of
@@ -36,7 +37,6 @@ from .proposal_features import (
     copy_of,
     cut_share,
     features_of,
-    lines_go_on,
     score_of,
     share_on_edges,
 )
@@ -91,7 +91,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     size = (small.shape[1], small.shape[0])
     found = [(item, score_of(item.features)) for item in examined_candidates(small)]
     found = [pair for pair in found if pair[1] >= LEAST_SCORE]
-    found = _ending(found, pixels)
+    found = _owning(found, pixels)
     sharp = in_focus([item.mask for item, _ in found], small)
     found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
     shade, ground = FEATURES.index("shade"), FEATURES.index("ground")
@@ -118,11 +118,16 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     return with_model(alike or things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)[:most]
 
 
-def _ending(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[Examined, float]]:
-    """Those of ``found`` across whose outline no lines of ``pixels`` (H, W, 3) go on; all where none is left."""
+def _owning(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[Examined, float]]:
+    """Those of ``found`` that own their outline in ``pixels`` (H, W, 3), see ``border_ownership``; all where none is
+    left."""
     fine = copy_of(pixels, FINE)
-    lines = straight_lines(fine)
-    kept = [pair for pair in found if not lines_go_on(at_size_of(pair[0].mask, fine), lines)]
+    lines, lightness = straight_lines(fine), lightness_of(fine)
+    kept = []
+    for item, value in found:
+        mask = at_size_of(item.mask, fine)
+        if not lines_go_on(mask, lines) and not sides_go_on(mask, lightness):
+            kept.append((item, value))
     return kept or found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .box_crop import edge_crest
-from .mask_geometry import Mask, extent_of, grown, outline_of, ring_around, shrunk, solidity_of
+from .mask_geometry import Mask, extent_of, outline_of, ring_around, shrunk, solidity_of
 
 FEATURES = ("closed", "contrast", "contour", "cut", "agreement", "high", "solid", "size", "ground", "base", "shade")
 """Of a candidate: ``objectness``; distance of its colours from those around it; share of its outline on edges; share of
@@ -19,13 +19,6 @@ but shade on what surrounds it."""
 WEIGHTS = np.array([2.5, 1.2, 2.0, -5.0, 1.0, -2.0, 1.5, 0.35, -3.0, 1.5, -4.0])
 OFFSET = -2.0
 """Logistic regression of ``FEATURES`` on whether a candidate is an object."""
-
-
-ACROSS, LEAST_ACROSS_PX = 0.06, 6.0
-"""Length on either side of an outline, over the thing's size and in pixels, from which a straight line crosses it."""
-LINES_ACROSS, ALL_ACROSS = 2, 0.25
-"""Lines that cross an outline, and the sum of their shorter sides over the thing's size, from which it is no outline of
-a thing. Of 76 things in photos none had two; boards lit by the sun had 0.36, tableware behind a lattice 1.4."""
 
 
 def copy_of(pixels: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
@@ -39,27 +32,6 @@ def at_size_of(mask: Mask, picture: NDArray[np.uint8]) -> Mask:
     """Return ``mask``, of any size, at that of ``picture`` (H, W, 3)."""
     large = cv2.resize(mask.astype(np.float32), picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(large > 0.5)
-
-
-def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
-    """Return whether ``lines`` (n, 4) go on across the outline of ``mask`` (H, W): a thing hides the lines behind it,
-    but light and prints lie on what has them."""
-    kernel = np.ones((5, 5), np.uint8)
-    inside = cv2.erode(mask.astype(np.uint8), kernel) > 0
-    outside = ~grown(mask, 2)
-    size, height, width = float(np.sqrt(mask.sum())), *mask.shape
-    least = max(LEAST_ACROSS_PX, ACROSS * size)
-    counts = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1]).astype(int)
-    across = []
-    for (x0, y0, x1, y1), count in zip(lines, counts, strict=True):
-        if count < 2.0 * least:
-            continue
-        columns = np.clip(np.round(np.linspace(x0, x1, count)).astype(int), 0, width - 1)
-        rows = np.clip(np.round(np.linspace(y0, y1, count)).astype(int), 0, height - 1)
-        shorter = min(int(inside[rows, columns].sum()), int(outside[rows, columns].sum()))
-        if shorter >= least:
-            across.append(shorter)
-    return len(across) >= LINES_ACROSS and sum(across) > ALL_ACROSS * size
 
 
 def features_of(
