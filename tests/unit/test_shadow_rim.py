@@ -9,7 +9,8 @@ from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.lighting.ground_pixels import ground_pixels, proxy_body
 from physgen.sim.reconstruct.lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes
-from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim
+from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim, observed_darkening
+from PIL import Image
 from scipy import ndimage
 
 WIDTH, HEIGHT = 240, 160
@@ -60,3 +61,14 @@ def test_only_ground_whose_sky_the_object_hides_belongs_to_the_rim():
     assert dark_rim(ground, prior, near + 1.0, near).any()
     assert not dark_rim(ground, prior, near, near).any()
     assert not dark_rim(ground, prior, near + 1.0, near + 1.0).any()
+
+
+@pytest.mark.parametrize(("kept", "least", "most"), [(0.3, 0.7, 1.3), (1.0, -0.3, 0.3), (2.0, -1.0, -0.3)])
+def test_a_shadow_is_seen_to_be_darker_than_the_ground_beside_it(kept, least, most):
+    """All bright leaves below a log were a backpack's shadow, and became as dark as the log."""
+    near = ROWS > 120.0
+    pixels, saucer = photo(near, kept)
+    ground = ground_pixels(pixels, [saucer], CAMERA, [proxy_body(saucer, CAMERA)])
+    small = np.asarray(Image.fromarray(near).resize(ground.known.shape[::-1]))[ground.rows, ground.columns]
+    assert least < observed_darkening(ground, np.where(small, 0.3, 1.0)) < most
+    assert observed_darkening(ground, np.ones(len(small))) == 1.0

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...scene.model import Camera
 from .relit_ground import near_any, smoothed
+from .stretch_inpainting import fill_stretches
 from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
-from .texture_prediction import shift_to_known, shifted
+from .texture_prediction import shift_to_known, shifted, stretches
 from .top_view import to_photo, to_top_view, top_views, visible_in_photo
 
 Mask = NDArray[np.bool_]
@@ -116,17 +117,10 @@ def _with_grain(picture: Picture, hole: Mask, known: Mask, side: float, blur: fl
     if share == 0.0:
         return match_grain(picture, hole, known)
     # Single spots and edges would be seen twice.
-    source, laid, left = np.clip(detail, -4.0 * grain, 4.0 * grain), detail.copy(), hole.copy()
-    for _ in range(STRETCHES):
-        shift = shift_to_known(left, inner, level=LEVEL_ROWS)
-        if shift is None:
-            break
-        there = left & shifted(inner, -shift[0], -shift[1])
-        new = shifted(source, -shift[0], -shift[1])
-        laid[there] = (1.0 - share) * detail[there] + share * new[there]
-        left &= ~there
-        if left.sum() < 0.01 * hole.sum():
-            break
+    source, laid = np.clip(detail, -4.0 * grain, 4.0 * grain), detail.copy()
+    for stretch in stretches(hole, inner, most=STRETCHES, level=LEVEL_ROWS):
+        new = stretch.copied(source)
+        laid[stretch.new] = (1.0 - share) * detail[stretch.new] + share * new[stretch.new]
     return match_grain(np.asarray(np.where(hole[..., None], smooth + laid, picture), np.float32), hole, known)
 
 
@@ -178,6 +172,11 @@ def by_rows_without_light(task: InpaintingTask) -> Picture:
 def as_surface(task: InpaintingTask) -> Picture:
     """Return the picture inpainted as one surface seen frontally."""
     return _in_photo(task, fill_surface)
+
+
+def by_stretches(task: InpaintingTask) -> Picture:
+    """Return the picture inpainted with large copies from the same height, for irregular surfaces."""
+    return _in_photo(task, fill_stretches)
 
 
 def as_ground(task: InpaintingTask) -> Picture:
@@ -254,10 +253,12 @@ def box(mask: Mask, margin: int) -> tuple[slice, slice]:
     )
 
 
+BY_STRETCHES = "by stretches"
 METHODS: dict[str, Method] = {
     "by rows": by_rows,
     "by rows without light": by_rows_without_light,
     "as a surface": as_surface,
+    BY_STRETCHES: by_stretches,
     "as ground": as_ground,
 }
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from ...composite.inpaint import FillOptions, inpaint_once
-from .texture_prediction import predict_texture, shift_to_known, shifted
+from .texture_prediction import predict_texture, stretches
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -264,16 +264,9 @@ def _donor(pattern: Picture, known: Mask, hole: Mask) -> Picture:
     middle = np.median(pattern[known][:: max(1, int(known.sum()) // 20_000)], axis=0)
     most = 3.0 * _spread(pattern[known] - middle)
     pattern = np.clip(pattern, middle - most, middle + most)
-    result, left = np.where(known[..., None], pattern, 0.0).astype(np.float32), hole.copy()
-    for _ in range(DONORS):
-        shift = shift_to_known(left, known)
-        if shift is None:
-            break
-        there = left & shifted(known, -shift[0], -shift[1])
-        result[there] = shifted(pattern, -shift[0], -shift[1])[there]
-        left &= ~there
-        if left.sum() < 0.01 * hole.sum():
-            break
+    result = np.where(known[..., None], pattern, 0.0).astype(np.float32)
+    for stretch in stretches(hole, known, most=DONORS):
+        result[stretch.new] = stretch.copied(pattern)[stretch.new]
     return result
 
 

@@ -9,6 +9,8 @@ Imaging Sci. 10, 2017). It is the linear estimate of least squared error: a mean
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -106,6 +108,42 @@ def shifted(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
     of = (slice(max(-rows, 0), height + min(-rows, 0)), slice(max(-columns, 0), width + min(-columns, 0)))
     result[to] = image[of]
     return result
+
+
+NEWLY = 0.01
+"""Share of a hole left below which no further stretch is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """shift: rows and columns from the hole to its source. there: (h, w) pixels of the hole that have a source. new:
+    those that no stretch before it covers."""
+
+    shift: tuple[int, int]
+    there: Mask
+    new: Mask
+
+    def copied(self, picture: Picture) -> Picture:
+        """Return ``picture`` (h, w, …) with the source moved to the hole."""
+        return np.asarray(shifted(picture, -self.shift[0], -self.shift[1]))
+
+
+def stretches(hole: Mask, source: Mask, *, most: int, level: float = 0.0) -> Iterator[Stretch]:
+    """Yield at most ``most`` copies of ``source`` (h, w) that cover ``hole`` (h, w), each as large as possible.
+
+    level: cost of a source at another height, over the picture's height and what it covers.
+    """
+    left = hole.copy()
+    for _ in range(most):
+        shift = shift_to_known(left, source, level=level)
+        if shift is None:
+            return
+        there = hole & shifted(source, -shift[0], -shift[1])
+        new = there & left
+        left &= ~new
+        yield Stretch(shift, there, new)
+        if left.sum() < NEWLY * hole.sum():
+            return
 
 
 def conditional_mean(values: Picture, known: Mask, reach: float) -> Picture:

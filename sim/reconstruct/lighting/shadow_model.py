@@ -69,6 +69,10 @@ RIM_SHADOW = 0.5
 the sill of a car, shades a strip that a rough proxy body does not."""
 
 
+STEP, LEAST_STEP = 0.1, 0.005
+"""Distance over the object's size within which a shadow's border is looked at; step of the logarithm that is noise."""
+
+
 def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values, distance: Values) -> Values:
     """Return the probability (N, levels) that pixels of ``ground`` keep each of ``LEVELS`` of their light.
 
@@ -151,6 +155,22 @@ def shadow_probability(
     lit = shadow <= 0.5
     blurred = ground.blurred(np.where(lit, kept[1], kept[0]), SHARPNESS)
     return shadow, penumbra, np.where(lit, blurred, np.minimum(blurred, kept[0]))
+
+
+def observed_darkening(ground: GroundPixels, left: Values) -> float:
+    """Return how much darker ``ground`` is seen to be over how much darker ``left`` (N,), the share of light that a
+    shadow leaves it, says: about 1 for a shadow, 0 or less for another surface.
+
+    Only what changes within ``STEP`` of the object's size counts. Over more, the ground's colour without the shadow is
+    not known: where it is a smooth field beside one surface, that field can make anything of another one.
+    """
+    sigma = max(2.0, STEP * ground.object_side)
+    told, seen = (
+        values - ground.blurred(values, sigma) for values in (np.log(np.maximum(left, 0.02)), ground.colour @ LUMINANCE)
+    )
+    # Where nothing is told, nothing speaks against it.
+    noise = len(told) * LEAST_STEP**2
+    return float(((told * seen).sum() + noise) / (np.square(told).sum() + noise))
 
 
 def _grown(ground: GroundPixels, prior: Values, likelihood: Values, reached: Mask) -> tuple[Values, Mask]:
