@@ -26,7 +26,7 @@ import trimesh
 from hypothesis import settings
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest
 from physgen.sim.reconstruct.background import background_inpainting
-from physgen.sim.reconstruct.background.inpainting_methods import MethodChoice
+from physgen.sim.reconstruct.background.method_choice import MethodChoice
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.model import Camera, SceneModel, SceneObject

@@ -12,12 +12,10 @@ from physgen.sim.reconstruct.background.inpainting_methods import (
     METHODS,
     VIEW_PIXELS,
     InpaintingTask,
-    choose_method,
     lay_grain,
     match_grain,
-    similarity,
-    trial_holes,
 )
+from physgen.sim.reconstruct.background.method_choice import choose_method, similarity, trial_holes
 from physgen.sim.reconstruct.background.surface_edges import edges_behind
 from physgen.sim.reconstruct.background.surface_inpainting import clamp_to_surroundings, logarithms
 from physgen.sim.reconstruct.background.top_view import top_views, visible_in_photo

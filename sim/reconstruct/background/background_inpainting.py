@@ -18,7 +18,8 @@ from ...composite.inpaint import FillOptions
 from ...errors import InputError
 from ...scene.model import Camera
 from ..segmentation.plain_backdrop import plain_backdrop
-from .inpainting_methods import METHODS, InpaintingTask, MethodChoice, box, choose_method
+from .inpainting_methods import BY_STRETCHES, METHODS, InpaintingTask, box
+from .method_choice import MethodChoice, choose_method
 from .relit_ground import continued, near_any, relit, smoothed
 from .surface_edges import Edge, edges_behind
 from .surface_inpainting import DARKEST, logarithms
@@ -184,7 +185,7 @@ GOOD = 32.0
 """Score in decibels above which the inpainting is right, as on a plain wall, where a plain colour does no worse."""
 NOTICED = 0.01
 """Share of the photo above which a guess gives a notice."""
-PHOTO_WAYS = ("by rows", "by rows without light", "as a surface")
+PHOTO_WAYS = ("by rows", "by rows without light", "as a surface", BY_STRETCHES)
 GROUND_WAYS = ("as ground",)
 
 

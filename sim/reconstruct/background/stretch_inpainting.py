@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite.inpaint import FillOptions
-from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
+from .relit_ground import smoothed
+from .surface_inpainting import clamp_to_surroundings, fill_surface, logarithms
 from .texture_prediction import Stretch, stretches
 
 Mask = NDArray[np.bool_]
@@ -29,6 +30,37 @@ COST = 100.0
 """Scale of logarithms in the search for seams, whose costs are rounded."""
 
 
+FINE, COARSE = 0.05, 0.15
+"""Blurs over the hole's size: below the first is detail, above the second level."""
+GRAINY = 0.7
+"""Robust over plain deviation of the detail above which it is grain, without edges. Grass and asphalt have 0.8 to 0.9,
+a floor, tables and a rock 0.3 to 0.4."""
+EVEN = 0.35
+"""Deviation of the level along rows over that of the detail, below which the surface is the same all along. Grass and
+asphalt have 0.1 to 0.2; grass with a tree behind it 0.5, a wall above a table 1.1."""
+FEWEST = 100
+"""Pixels of a row, or of all, that tell something."""
+
+
+def is_irregular(picture: Picture, hole: Mask, barred: Mask) -> bool:
+    """Return whether what is around ``hole`` (h, w) is grain all along, such as grass, of which any copy will do.
+
+    picture: (h, w, 3), values 0 to 255. barred: (h, w) other pixels that tell nothing.
+    """
+    known, side = ~(hole | barred), float(np.sqrt(hole.sum()))
+    logs = logarithms(picture)
+    fine = max(1.0, FINE * side)
+    inner = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 5) > fine
+    if inner.sum() < FEWEST:
+        return False
+    detail = (logs - smoothed(logs, known, fine)).mean(axis=-1)[inner]
+    spread = float(detail.std())
+    grain = 1.4826 * float(np.median(np.abs(detail - np.median(detail))))
+    level = smoothed(logs, known, max(1.0, COARSE * side)).mean(axis=-1)
+    along = [float(row[seen].std()) for row, seen in zip(level, known, strict=True) if seen.sum() > FEWEST]
+    return bool(along) and grain > GRAINY * spread and float(np.mean(along)) < EVEN * spread
+
+
 def fill_stretches(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
     """Return ``picture`` (h, w, 3), values 0 to 255, with ``hole`` (h, w) inpainted from pixels in neither it nor
     ``barred`` (h, w); what no stretch covers, as a surface.
@@ -37,28 +69,26 @@ def fill_stretches(picture: Picture, hole: Mask, barred: Mask, options: FillOpti
     """
     known = ~(hole | barred)
     logs = logarithms(picture)
-    slow, lack = light_field(logs, known, hole)
-    detail = np.where(known[..., None], logs - slow - lack, 0.0).astype(np.float32)
     # Pixels beside unknown ones are mixed with them.
     inner = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     found = list(stretches(hole, inner, most=MOST, level=LEVEL))
-    covered = np.zeros_like(hole)
-    for stretch, own in zip(found, _joined(found, detail, hole), strict=True):
-        detail[own] = stretch.copied(detail)[own]
+    laid, covered = logs.copy(), np.zeros_like(hole)
+    for stretch, own in zip(found, _joined(found, logs, hole), strict=True):
+        laid[own] = stretch.copied(logs)[own]
         covered |= own
-    new = np.where(covered[..., None], detail + slow, logs).astype(np.float32)
-    filled = np.exp(clamp_to_surroundings(new, covered, known)) if covered.any() else picture
-    result = np.where(covered[..., None], filled, picture).astype(np.float32)
+    if covered.any():
+        laid = clamp_to_surroundings(laid, covered, known)
+    result = np.where(covered[..., None], np.exp(laid), picture).astype(np.float32)
     left = hole & ~covered
     return fill_surface(result, left, barred, options) if left.any() else result
 
 
-def _joined(found: list[Stretch], detail: Picture, hole: Mask) -> list[Mask]:
-    """The part (h, w) of the hole that each stretch gets, by cuts along which the copies of ``detail`` differ least."""
+def _joined(found: list[Stretch], logs: Picture, hole: Mask) -> list[Mask]:
+    """The part (h, w) of the hole that each stretch gets, by cuts along which the copies of ``logs`` differ least."""
     if len(found) < 2:
         return [stretch.there for stretch in found]
     rows, columns = (slice(int(axis.min()), int(axis.max()) + 1) for axis in np.nonzero(hole))
-    copies = [np.ascontiguousarray(COST * item.copied(detail)[rows, columns], np.float32) for item in found]
+    copies = [np.ascontiguousarray(COST * item.copied(logs)[rows, columns], np.float32) for item in found]
     masks = [255 * np.ascontiguousarray(item.there[rows, columns], np.uint8) for item in found]
     # OpenCV's declared types know only its own matrices here.
     finder: Any = cv2.detail.GraphCutSeamFinder("COST_COLOR")
