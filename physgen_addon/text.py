@@ -65,7 +65,8 @@ def sentences(layout: bpy.types.UILayout, context: bpy.types.Context, text: str,
 
 def room(context: bpy.types.Context, sides: float) -> int:
     """Return how many characters fit beside each other in the region but for ``sides``, px at the usual scale."""
-    scale = context.preferences.system.ui_scale * context.preferences.view.ui_scale
+    # It has the screen's resolution and the scale that the user has chosen.
+    scale = context.preferences.system.ui_scale
     width = context.region.width if context.region is not None else 300
     return int((width - sides * scale) / (5.8 * scale))
 

@@ -4,6 +4,7 @@
 import math
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import physgen
@@ -248,6 +249,14 @@ def test_a_long_name_takes_the_place_of_its_material_in_a_narrow_list():
     assert "Wood" in draw_all("objects")["PHYSGEN_PT_objects"].words
     item.name = "Collection Cube simulated"
     assert "Wood" not in draw_all("objects")["PHYSGEN_PT_objects"].words
+
+
+def test_as_much_fits_beside_each_other_at_every_scale_of_the_interface():
+    """Blender's ``system.ui_scale`` has the user's scale in it: twice that, and half of the sidebar stays empty."""
+    usual = checked_layout.Context()
+    preferences = SimpleNamespace(system=SimpleNamespace(ui_scale=1.5), view=SimpleNamespace(ui_scale=1.5))
+    large = checked_layout.Context(preferences=preferences, region=SimpleNamespace(width=1.5 * usual.region.width))
+    assert text.room(large, 70) == text.room(usual, 70)
 
 
 def test_numbers_of_a_video_that_it_knows_itself_are_switches():
