@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The substep loop and the arrays on the device. Lengths in cells; ``packing`` and ``world_view`` convert."""
+"""The substep loop over particles and grid. Lengths in cells; ``packing`` and ``world_view`` convert."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,46 +12,22 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..events import IsCancelled
-from .block_lists import BlockLists, block_keys, bytes_of
+from .block_lists import BlockLists, bytes_of
 from .implicit import ImplicitSteps, Matter, StepReport
 from .kernels import layout, parallel_sorting, runtime, sorting, time_stepping
 from .kernels.constitutive_response import law_set
-from .kernels.kernel_arrays import (
-    AdhesionArrays,
-    CouplingArrays,
-    ParticleArrays,
-    ParticleState,
-    StepLimits,
-    WorldArrays,
-)
+from .kernels.kernel_arrays import AdhesionArrays, CouplingArrays, StepLimits, WorldArrays
 from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
-from .kernels.layout import FIXED_ONE, ivec3, mat3, vec3, vec4
 from .kernels.runtime import new_array
 from .kernels.substep import REPEATS, rigid_launcher, substep_launcher
 from .kernels.time_stepping import prime_worlds
 from .packing import NewParticles, PackedWorlds
+from .particle_store import ParticleStore, State, new_rows, positions_of
 from .rigid.rigid_bodies import RigidBodies
 from .rigid.rigid_motion import advance_bodies, carry_colliders
 
 Array = NDArray[np.float64]
-State = dict[str, NDArray[np.generic]]
-
-ALWAYS = (*ParticleState._fields, "constants", "ids")
-"""Arrays that every particle needs."""
-
-HELD = {
-    "constants": sorting.permute_held_vectors,
-    "ids": sorting.permute_held_integers,
-    "material": sorting.permute_held_integers,
-    "volumes": sorting.permute_held_numbers,
-    "anchors": sorting.permute_held_vectors,
-}
-"""Arrays that no substep changes, and what sorts each. There is one of each; of the others two, between which a sort
-moves them, because the state from before it must be there for another try."""
-
-MATTER = ("memory", "material")
-"""Arrays that only models other than plain fixed-corotated elasticity need."""
 
 MOST_RETRIES = 6
 """Times that a stretch of substeps is repeated with half the step before the run fails."""
@@ -80,10 +56,7 @@ class Diverged(Exception):
 
 
 class Engine:
-    """State of all worlds on the device.
-
-    Particles are numbered by the caller (``ids``); the engine keeps them sorted by field and block.
-    """
+    """State of all worlds on the device. particles: numbered by the caller, and kept sorted by field and block."""
 
     def __init__(
         self,
@@ -110,14 +83,8 @@ class Engine:
         self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
         several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
         anchored = bool(numbers.field_integers[:, layout.HAS_ANCHORS].any())
-        self._names = ALWAYS + (() if models.only_elastic else MATTER)
-        self._names += ("volumes",) if several else ()
-        self._names += ("anchors",) if anchored else ()
-        self._names += ("slopes",) if models.volumetric else ()
-        self._names += ("conformation",) if models.relaxing else ()
         self._several = several
         self._thin = several and numbers.thin
-        self.count = 0
         self.retries = 0
         self._implicit: ImplicitSteps | None = None
         self._table = upload_new(numbers.table)
@@ -147,12 +114,7 @@ class Engine:
         control[:, layout.STATUS] = layout.DONE
         control[:, layout.LONGEST_STEP] = math.inf
         self._put_control(control)
-        self._capacity = max(1, capacity)
-        held = self._particle_arrays(name for name in self._names if name in HELD)
-        moving = [name for name in self._names if name not in HELD]
-        self._particles = [{**self._particle_arrays(moving), **held} for _ in range(2)]
-        self._keys = new_array(ti.i64, self._capacity)
-        self._targets = new_array(ti.i32, self._capacity)
+        self.particles = ParticleStore(capacity=capacity, models=models, several=several, anchored=anchored)
         self._blocks = BlockLists(
             field_count=self.field_count,
             rigid_bodies=self._most_rigid_bodies,
@@ -164,30 +126,11 @@ class Engine:
 
     # ---- arrays -------------------------------------------------------------------------------------------------
 
-    def _particle_arrays(self, names: Iterable[str]) -> dict[str, ti.Ndarray]:
-        kinds = {
-            "x": ivec3,
-            "v": vec3,
-            "C": mat3,
-            "F": mat3,
-            "constants": vec4,
-            "reaction": vec4,
-            "ids": ti.i32,
-            "memory": ti.f32,
-            "material": ti.i32,
-            "volumes": ti.f32,
-            "anchors": vec4,
-            "slopes": vec3,
-            "conformation": mat3,
-        }
-        return {name: new_array(kinds[name], self._capacity) for name in names}
-
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
-        arrays = [*self._particles[0].values(), *(a for n, a in self._particles[1].items() if n not in HELD)]
-        arrays += [a for a in (*vars(self).values(), *self._adhesion) if isinstance(a, ti.Ndarray)]
-        return self._blocks.device_bytes + sum(bytes_of(a) for a in arrays)
+        arrays = [a for a in (*vars(self).values(), *self._adhesion) if isinstance(a, ti.Ndarray)]
+        return self._blocks.device_bytes + self.particles.device_bytes + sum(bytes_of(a) for a in arrays)
 
     def control(self) -> Array:
         """Progress of the worlds (W, CONTROL_ROW), as ``layout`` names its columns."""
@@ -206,39 +149,17 @@ class Engine:
         """Set the rows of the materials for the next segment of time."""
         self._table.from_numpy(np.ascontiguousarray(table, dtype=np.float32).ravel())
 
-    def set_moduli(self, first: int, shares: ti.Ndarray, shear: float, bulk: float) -> None:
-        """Set 2 mu V0 and lambda V0 of the particles from number ``first`` on to ``shares`` of these two numbers, see
-        ``sorting.set_moduli``."""
-        here, end = self._particles[0], first + shares.shape[0]
-        sorting.set_moduli(self.count, first, end, shear, bulk, shares, here["ids"], here["constants"])
-
     # ---- particles in and out -----------------------------------------------------------------------------------
 
     def add(self, groups: Sequence[tuple[NewParticles, float]]) -> None:
         """Add particles, each group with the speed in cells/s of the fastest wave in it (``bounding_speed``)."""
         state = self._download()
-        parts = {name: [state[name]] for name in self._names}
+        parts = {name: [state[name]] for name in self.particles.names}
         all_keys = [state["keys"].astype(np.int64)]
         control, means = self.control(), self._means.to_numpy()
         for added, wave_speed in groups:
-            x, keys = places_in_blocks(added.field, added.x)
-            count = len(x)
-            new = {
-                "x": x,
-                "v": added.v.astype(np.float32),
-                "C": added.C.astype(np.float32),
-                "F": added.F.astype(np.float32),
-                "constants": added.constants.astype(np.float32),
-                "reaction": np.zeros((count, 4), dtype=np.float32),
-                "ids": added.ids.astype(np.int32),
-                "memory": np.zeros(count, dtype=np.float32),
-                "material": added.material.astype(np.int32),
-                "volumes": added.volumes.astype(np.float32),
-                "anchors": added.anchors.astype(np.float32),
-                "slopes": np.zeros((count, 3), dtype=np.float32),
-                "conformation": np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3)),
-            }
-            for name in self._names:
+            new, keys = new_rows(added)
+            for name in self.particles.names:
                 parts[name].append(new[name])
             all_keys.append(keys)
             row = control[self._field_world[added.field]]
@@ -253,8 +174,8 @@ class Engine:
         order = np.argsort(keys >> 48, kind="stable")
         # One after the other: all at once would take as much again as the particles.
         del state
-        for name in self._names:
-            self._put(name, np.concatenate(parts.pop(name))[order])
+        for name in self.particles.names:
+            self.particles.put(name, np.concatenate(parts.pop(name))[order])
         self._begin(keys[order])
 
     def expect(self, world: int, *, speed: float = 0.0, wave_speed: float = 0.0) -> None:
@@ -268,43 +189,28 @@ class Engine:
     def places(self) -> tuple[NDArray[np.int32], Array]:
         """Numbers (n,) of the particles as the caller counts, and their positions (n, 3) in cells."""
         state = self._download(("ids", "x"))
-        return np.asarray(state["ids"], dtype=np.int32), _positions(state["keys"].astype(np.int64), state["x"])
-
-    def values(self, name: str) -> NDArray[np.generic]:
-        """The particles' array ``name``, in the order of ``places``."""
-        return np.asarray(self._particles[0][name].to_numpy()[: self.count])
+        return np.asarray(state["ids"], dtype=np.int32), positions_of(state["keys"].astype(np.int64), state["x"])
 
     def _download(self, names: Sequence[str] | None = None) -> State:
         """The particles in engine order, all or those arrays, with the block key of each under "keys"."""
-        n = self.count
-        state: State = {name: self._particles[0][name].to_numpy()[:n] for name in names or self._names}
-        state["keys"] = self._blocks.particle_keys(n)
+        state = self.particles.download(names)
+        state["keys"] = self._blocks.particle_keys(self.particles.count)
         return state
 
     def _upload(self, state: Mapping[str, NDArray[np.generic]], keys: NDArray[np.int64]) -> None:
-        for name in self._names:
-            self._put(name, state[name])
+        for name in self.particles.names:
+            self.particles.put(name, state[name])
         self._begin(keys)
-
-    def _put(self, name: str, values: NDArray[np.generic]) -> None:
-        """Let the first particles have these ``values`` in the array ``name``."""
-        array = self._particles[0][name]
-        host = array.to_numpy()
-        host[: len(values)] = values
-        array.from_numpy(host)
 
     def _begin(self, keys: NDArray[np.int64]) -> None:
         """Go on with the particles that were put, whose blocks these ``keys`` name."""
-        host = self._keys.to_numpy()
-        host[: len(keys)] = keys
-        self._keys.from_numpy(host)
-        self.count = len(keys)
+        self.particles.begin(keys)
         self._group()
 
     def state(self) -> State:
         """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells."""
         state = self._download()
-        state["position"] = _positions(state["keys"].astype(np.int64), state["x"])
+        state["position"] = positions_of(state["keys"].astype(np.int64), state["x"])
         state["control"] = self.control()
         state["means"] = self._means.to_numpy()
         return state
@@ -324,28 +230,15 @@ class Engine:
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
         rebase = parallel_sorting.rebase_of(self._lanes) if self._lanes.parallel else sorting.rebase
-        rebase.launch(self._particles[0]["x"], self._keys, self._worlds(), self._blocks.particle_blocks)
+        rebase.launch(self.particles["x"], self.particles.keys, self._worlds(), self._blocks.particle_blocks)
         self._group()
 
     def _group(self, *, again: bool = False) -> None:
-        """Lists, neighbours and permutation for the blocks named in ``_keys``; ``again``: those of the last time. What
-        no substep changes has been moved already, and a card would find another order."""
-        old, new = self._particles
+        """Lists, neighbours and permutation for the particles' ``keys``; ``again``: those of the last time."""
+        here = self.particles
         if not again:
-            self._blocks.build(self.count, old["x"], self._keys, self._targets)
-            for name, move in HELD.items():
-                if name in self._names:
-                    move.launch(self.count, self._targets, old[name], new["reaction"])
-        sorting.permute.launch(self.count, self._targets, _state_of(old), _state_of(new))
-        movers = {
-            "memory": sorting.permute_numbers,
-            "slopes": sorting.permute_triples,
-            "conformation": sorting.permute_matrices,
-        }
-        for name in self._names:
-            if name in movers:
-                movers[name].launch(self.count, self._targets, old[name], new[name])
-        self._particles.reverse()
+            self._blocks.build(here.count, here["x"], here.keys, here.targets)
+        here.sort(again=again)
         self._blocks.list_contacts(self._worlds(), self.rigid_bodies, several=self._several)
 
     # ---- time ---------------------------------------------------------------------------------------------------
@@ -390,8 +283,7 @@ class Engine:
                 if not lost.any():
                     break
                 attempts[lost] += 1
-                # The other half of the particle arrays still holds the state from before the sort.
-                self._particles.reverse()
+                self.particles.unsort()
                 if means is not None:
                     self._means.from_numpy(means)
                 if before is not None:
@@ -442,7 +334,7 @@ class Engine:
             blocks=blocks.particle_blocks,
             grid=blocks.grid_blocks,
             near=blocks.near_blocks,
-            particles=self._particle_bundle(),
+            particles=self.particles.bundle(self._blocks.spares),
             nodes=blocks.nodes,
             colliders=rigid.bodies,
             shapes=rigid.shapes,
@@ -472,14 +364,14 @@ class Engine:
     def _run_substeps(self, stop: IsCancelled, expected: int) -> None:
         """Substeps until every world wants a sort, is done or has diverged; ``expected``: launches that it is sure to
         take, about."""
-        if not (self.count or self.rigid_bodies.solved_together):
+        if not (self.particles.count or self.rigid_bodies.solved_together):
             if stop():
                 raise Stopped
             rigid = self.rigid_bodies
             advance_bodies(self._limits(), self._worlds(), rigid.bodies, rigid.shapes, rigid.contacts)
             return
         launch = self._launcher().bind(self._arguments())
-        if not (self._lanes.parallel and self.count):
+        if not (self._lanes.parallel and self.particles.count):
             self._running[0] = self.world_count
             while self._running[0] > 0:
                 if stop():
@@ -496,7 +388,7 @@ class Engine:
 
     def _launcher(self) -> Launcher:
         """The kernels that the present lists of blocks require."""
-        if not self.count:
+        if not self.particles.count:
             return rigid_launcher(runtime.generation())
         return substep_launcher(
             runtime.generation(),
@@ -523,7 +415,7 @@ class Engine:
             "near": self._blocks.near_blocks,
             "overlap": self._blocks.overlap_blocks,
             "table": self._blocks.particle_table,
-            "particles": self._particle_bundle(),
+            "particles": self.particles.bundle(self._blocks.spares),
             "nodes": self._blocks.nodes,
             "flow": self._blocks.flow,
             "bodies": self.rigid_bodies.bodies,
@@ -535,10 +427,6 @@ class Engine:
             "adhesion": self._adhesion,
             "running": self._running,
         }
-
-    def _coupling(self) -> CouplingArrays:
-        pushes = self._blocks.pushes
-        return CouplingArrays(self.rigid_bodies.count, self._most_rigid_bodies, self._touching, pushes)
 
     def _limits(self) -> StepLimits:
         return StepLimits(self.cfl_elastic, self.cfl_velocity)
@@ -557,28 +445,6 @@ class Engine:
             control=self._control,
             means=self._means,
         )
-
-    def _particle_bundle(self) -> ParticleArrays:
-        """Arrays that no kernel of this engine reads are stood in for by others of the same type."""
-        here = self._particles[0]
-        spare = {**self._blocks.spares, "slopes": here["v"], "conformation": here["C"]}
-        return ParticleArrays(**{name: here.get(name, spare.get(name)) for name in ParticleArrays._fields})
-
-
-def _state_of(arrays: Mapping[str, ti.Ndarray]) -> ParticleState:
-    return ParticleState(*(arrays[name] for name in ParticleState._fields))
-
-
-def _positions(keys: NDArray[np.int64], x: NDArray[np.generic]) -> Array:
-    """Positions (n, 3) in cells of particles at ``x`` (n, 3) in the blocks of these keys."""
-    cells = np.stack([(keys >> shift & 0xFFFF) - sorting.BIAS for shift in (32, 16, 0)], axis=1)
-    return np.asarray(4 * cells - 1 + x.astype(np.float64) / FIXED_ONE)
-
-
-def places_in_blocks(field: int, cells: Array) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Places (n, 3) in cells as ``state`` has them: "x" (n, 3) from the corner of the block of each, "keys" (n,)."""
-    block = np.clip(np.floor(cells - 0.5).astype(np.int64) >> 2, -layout.FARTHEST_BLOCK, layout.FARTHEST_BLOCK)
-    return np.rint((cells - (4 * block - 1)) * FIXED_ONE).astype(np.int32), block_keys(np.int64(field), block)
 
 
 def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

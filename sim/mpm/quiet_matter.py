@@ -107,7 +107,7 @@ class QuietMatter:
     def _quiet(self, engine: Engine, most_hit: float) -> bool:
         """Whether every body is."""
         ids, x = engine.places()
-        v, a, constants = (engine.values(name).astype(np.float64) for name in ("v", "reaction", "constants"))
+        v, a, constants = (engine.particles.values(name).astype(np.float64) for name in ("v", "reaction", "constants"))
         for i, rest in enumerate(self._rest):
             mine = (ids >= self._offsets[i]) & (ids < self._offsets[i + 1])
             if mine.any():

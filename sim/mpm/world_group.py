@@ -16,20 +16,31 @@ from ..events import IsCancelled, never
 from ..memory import return_freed_memory
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import packing
-from .colliders import SAME_TIME, Track
+from .colliders import SAME_TIME
 from .diagnostics import FittedGradients
-from .engine import MOST_RETRIES, Diverged, Engine, Stopped, places_in_blocks, upload_new
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped, upload_new
 from .kernels import layout, runtime
 from .kernels.lanes import lanes_of, windows_of
 from .kernels.time_stepping import RIGID_LOST
+from .particle_store import State
 from .quiet_matter import new_quiet_matter
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .sleeping import Sleepers
 from .solver_options import SolverOptions
+from .timed_events import (
+    BodyRows,
+    change_material,
+    checked_motion,
+    material_choice,
+    next_stop,
+    rows_of_body,
+    set_mean_velocity,
+    set_motion,
+    velocity_due,
+)
 from .world_setup import WorldSetup, check_start
 
 Array = NDArray[np.float64]
-State = dict[str, NDArray[np.generic]]
 
 CHECKPOINT_FORMAT = 2
 
@@ -38,10 +49,6 @@ RIGID_PREFIX = "solids."
 
 ROUNDING = 1e-12
 """Rounding error of sums of times, s."""
-
-PARAMETER_STEP, PARAMETER_PIECES = 1.0 / 240.0, 32
-"""A parameter on its way between two keyframes is constant for this many seconds at most, and for this part of the way;
-it has the value of the middle."""
 
 LEAST_WATCH = 1e-4
 """Seconds that pass at least between two looks at what may touch a sleeper."""
@@ -164,7 +171,12 @@ class WorldGroup:
         end = self._times[0] + duration
         while (self._times < end - ROUNDING).any():
             watch = self._wake_touched()
-            stops = np.array([min(self._next_stop(place, end), watch[place.world]) for place in self._places])
+            stops = np.array(
+                [
+                    min(next_stop(place, float(self._times[place.world]), end), watch[place.world])
+                    for place in self._places
+                ]
+            )
             self._engine.set_rows(
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
@@ -201,23 +213,6 @@ class WorldGroup:
         """Longest substep in s apart from waves: the option's, and that of springs."""
         return min([self.options.max_step, *(body.spring_step for body in place.setup.bodies)])
 
-    def _next_stop(self, place: packing.WorldSlot, end: float) -> float:
-        """The next time, up to ``end``, at which something in the world starts or changes its slope."""
-        now = float(self._times[place.world])
-        setup = place.setup
-        tracks = [setup.gravity_track]
-        single = []
-        for body in setup.bodies:
-            tracks += [body.acceleration, body.pin_motion, body.velocity_keys]
-            tracks += list(body.parameter_tracks.values())
-            single += [body.start_time, *(time for time, _ in body.material_track)]
-            single += [_parameter_stop(track, now) for track in body.parameter_tracks.values()]
-        for collider in setup.colliders:
-            tracks += [collider.translations, collider.rotations, collider.vertices]
-        knots = [t for t in single if now + SAME_TIME < t < end - SAME_TIME]
-        knots += [t for track in tracks if track is not None for t in track.knots(now + SAME_TIME, end - SAME_TIME)]
-        return min([end, *knots])
-
     def _follow_parameters(self, stops: Array) -> None:
         """Give bodies with tracks of parameters what those have in the middle of the segments up to ``stops`` (W,)."""
         middle = 0.5 * (self._times + stops)
@@ -232,10 +227,10 @@ class WorldGroup:
                 if self._followed.get(number) == material:
                     continue
                 if number not in self._shares:
-                    choice = self._material_choice(place, i, float(self._times[place.world]) + SAME_TIME)
+                    choice = material_choice(body, float(self._times[place.world]) + SAME_TIME)
                     self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
-                offset = int(self._offsets[number])
-                self._engine.set_moduli(offset, self._shares[number], material.shear_number, material.bulk_number)
+                offset, shares = int(self._offsets[number]), self._shares[number]
+                self._engine.particles.set_moduli(offset, shares, material.shear_number, material.bulk_number)
                 self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
                 self._followed[number] = material
                 changed = True
@@ -268,7 +263,7 @@ class WorldGroup:
                     if place.setup.bodies[i].rigid:
                         self._rigid_bodies.asleep.discard((world, place.setup.bodies[i].name))
                     else:
-                        choice = self._material_choice(place, i, now + SAME_TIME)
+                        choice = material_choice(place.setup.bodies[i], now + SAME_TIME)
                         fresh.append(packing.particles(place, i, int(self._offsets[first + i]), choice))
             until[world] = now + max(rest, LEAST_WATCH)
         if fresh:
@@ -321,7 +316,7 @@ class WorldGroup:
                 if not self._started[number] and not self._asleep[number] and body.start_time <= now:
                     self._started[number] = True
                     if not body.rigid:
-                        choice = self._material_choice(place, i, now)
+                        choice = material_choice(body, now)
                         fresh.append(packing.particles(place, i, int(self._offsets[number]), choice))
         if fresh:
             self._add(fresh)
@@ -331,41 +326,25 @@ class WorldGroup:
                 if self._started[int(self._first_body[place.world]) + i] and not body.rigid:
                     if any(then < time <= now for time, _ in body.material_track):
                         self._change_material(place, i, now)
-                    keys = body.velocity_keys
-                    due = [] if keys is None else [k for k, t in enumerate(keys.times) if then < t <= now]
-                    if keys is not None and due:
-                        self._set_velocity(place, i, keys.values[due[-1]])
-
-    @staticmethod
-    def _material_choice(place: packing.WorldSlot, body_index: int, now: float) -> NDArray[np.int32]:
-        """Material of each particle at time ``now``, counted as in ``material_index``."""
-        body = place.setup.bodies[body_index]
-        past = [index for time, index in body.material_track if time <= now]
-        if past:
-            return np.full(body.count, past[-1], dtype=np.int32)
-        return np.zeros(body.count, dtype=np.int32) if body.material_index is None else body.material_index
+                    velocity = velocity_due(body, then, now)
+                    if velocity is not None:
+                        self._set_velocity(place, i, velocity)
 
     def material_choice(self, world: int, index: int) -> NDArray[np.int32]:
         """Present material of each particle of body ``index``, counted as in ``material_index``."""
-        return self._material_choice(self._places[world], index, float(self._times[world]) + SAME_TIME)
+        return material_choice(self.setups[world].bodies[index], float(self._times[world]) + SAME_TIME)
 
-    def _rows_of(self, state: State, number: int) -> NDArray[np.bool_]:
-        ids = np.asarray(state["ids"], dtype=np.int64)
-        return (ids >= self._offsets[number]) & (ids < self._offsets[number + 1])
+    def _rows_of(self, state: State, number: int) -> BodyRows:
+        return rows_of_body(state, int(self._offsets[number]), int(self._offsets[number + 1]))
 
     def _change_material(self, place: packing.WorldSlot, body_index: int, now: float) -> None:
         """Switch the body's particles to another material from now on; their history variables are reset."""
-        choice = self._material_choice(place, body_index, now)
         number = int(self._first_body[place.world]) + body_index
         self._shares.pop(number, None)
         self._followed.pop(number, None)
         state = self._engine.state()
-        mine = self._rows_of(state, number)
-        order = np.asarray(state["ids"])[mine] - self._offsets[number]
-        constants, wave_speed = packing.stiffness(place.setup.bodies[body_index], choice, place.cells)
-        state["constants"][mine, 1:3] = constants[order]
-        state["material"][mine] = packing.first_material(place, body_index) + choice[order]
-        state["memory"][mine] = 0.0
+        choice = material_choice(place.setup.bodies[body_index], now)
+        wave_speed = change_material(state, self._rows_of(state, number), place, body_index, choice)
         self._engine.replace(state)
         self._engine.expect(place.world, wave_speed=wave_speed)
         self._host = None
@@ -374,13 +353,8 @@ class WorldGroup:
         """Set the body's mean velocity, m/s."""
         number = int(self._first_body[place.world]) + body_index
         state = self._engine.state()
-        mine = self._rows_of(state, number)
-        given = np.asarray(state["v"][mine], dtype=np.float64)
-        masses = np.asarray(state["constants"][mine, 0], dtype=np.float64)
-        given += velocity * place.cells.scale - np.average(given, axis=0, weights=masses)
-        state["v"][mine] = given.astype(np.float32)
+        fastest = set_mean_velocity(state, self._rows_of(state, number), velocity * place.cells.scale)
         self._engine.replace(state)
-        fastest = float(np.linalg.norm(given, axis=1).max())
         self._engine.expect(place.world, speed=fastest)
         self._host = None
 
@@ -400,32 +374,11 @@ class WorldGroup:
         if body.rigid or not self._started[number]:
             kind = "is rigid" if body.rigid else "has not started"
             raise InputError(f"body {body.name!r} {kind}: give motion to bodies of particles that have started")
-        given = _checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
+        given = checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
         state = dict(self.state())
-        mine = np.flatnonzero(self._rows_of(state, number))
-        order = np.asarray(state["ids"])[mine] - self._offsets[number]
-        scale = place.cells.scale
-        still = np.zeros((body.count, 3, 3))
-        new: dict[str, NDArray[np.generic]] = {
-            "v": given["velocities"] * scale,
-            "C": given.get("velocity_gradients", still),
-        }
-        if "gradients" in given:
-            new["F"] = given["gradients"]
-            if "conformation" in state:
-                # What relaxed in the old deformation does not belong to the new one.
-                new["conformation"] = np.broadcast_to(np.eye(3), (body.count, 3, 3))
-        if "positions" in given:
-            x, keys = places_in_blocks(place.field(index), place.cells.points_to_engine(given["positions"]))
-            new |= {"x": x, "keys": keys}
-            # Contact impulses at another place do not apply here.
-            new["reaction"] = np.zeros((body.count, 4))
-        for name, values in new.items():
-            changed = np.array(state[name])
-            changed[mine] = values[order].astype(changed.dtype)
-            state[name] = changed
+        set_motion(state, self._rows_of(state, number), place, index, given)
         self._engine.replace(state)
-        self._engine.expect(world, speed=float(np.linalg.norm(given["velocities"], axis=1).max()) * scale)
+        self._engine.expect(world, speed=float(np.linalg.norm(given["velocities"], axis=1).max()) * place.cells.scale)
         self._host = None
 
     def _lost(self, failure: Diverged) -> SimulationError:
@@ -495,10 +448,10 @@ class WorldGroup:
         if not self._started[number]:
             return resting
         state = self.state()
-        mine = self._rows_of(state, number)
-        values = np.asarray(state[name][mine], dtype=np.float64)
+        rows = self._rows_of(state, number)
+        values = np.asarray(state[name][rows.mine], dtype=np.float64)
         ordered = np.empty_like(values)
-        ordered[np.asarray(state["ids"])[mine] - self._offsets[number]] = values
+        ordered[rows.numbers] = values
         return ordered
 
     def checkpoint(self) -> State:
@@ -551,39 +504,3 @@ class WorldGroup:
         self._between = False
         self._host = None
         self._poses = {}
-
-
-def _parameter_stop(track: Track, now: float) -> float:
-    """The time until which a parameter on ``track`` may be taken as constant from ``now`` on; inf if it is."""
-    i = int(np.searchsorted(track.times, now + SAME_TIME, side="right"))
-    if i == 0 or i == len(track.times) or track.values[i] == track.values[i - 1]:
-        return math.inf
-    return now + max(min(PARAMETER_STEP, float(track.times[i] - track.times[i - 1]) / PARAMETER_PIECES), 2 * SAME_TIME)
-
-
-def _checked_motion(
-    name: str,
-    count: int,
-    velocities: Array,
-    velocity_gradients: Array | None,
-    positions: Array | None,
-    gradients: Array | None,
-) -> dict[str, Array]:
-    """The arguments that are given, as float64. Raises InputError on a wrong shape or a number that is not finite."""
-    shapes = {
-        "velocities": (velocities, (count, 3)),
-        "velocity_gradients": (velocity_gradients, (count, 3, 3)),
-        "positions": (positions, (count, 3)),
-        "gradients": (gradients, (count, 3, 3)),
-    }
-    given = {}
-    for field, (values, shape) in shapes.items():
-        if values is not None:
-            array = np.asarray(values, dtype=np.float64)
-            if array.shape != shape:
-                raise InputError(f"body {name!r}: {field} have shape {array.shape}: give {shape}, one a particle")
-            if not np.isfinite(array).all():
-                bad = int(np.argmin(np.isfinite(array.reshape(count, -1)).all(axis=1)))
-                raise InputError(f"body {name!r}: {field} of particle {bad} are {array[bad].tolist()}: give numbers")
-            given[field] = array
-    return given

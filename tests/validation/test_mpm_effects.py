@@ -476,7 +476,7 @@ def test_absent_effects_cost_nothing(box, options, similarity):
     for worlds in (plain, changed):
         assert worlds[0].group._engine.laws == 1
         assert worlds[0].group._engine._mean_fields == 0
-        assert worlds[0].group._engine._names == plain[0].group._engine._names
+        assert worlds[0].group._engine.particles.names == plain[0].group._engine.particles.names
         assert worlds.device_bytes == plain.device_bytes
     for item in (effect("magnus", lift_per_mass=0.1), tether(10.0, 0.1, 1.0, 1.0)):
         worlds = under(setup, [item], similarity, options)

@@ -15,28 +15,51 @@ from scipy.spatial.transform import Rotation
 from ...errors import InputError
 from ..bodies import BodyParticles, Vector
 from ..colliders import SAME_TIME, Collider, Surface
-from ..geometry.mass_properties import mass_properties
 from ..geometry.signed_distance import DistanceLattice
 from ..kernels.kernel_arrays import RigidArrays, RigidContacts, ShapeArrays
 from ..kernels.runtime import new_array
-from ..surface_contact import GROUND_NAME, MODES
 from ..world_setup import WorldSetup
 from . import rigid_layout as at
-from .collision_shapes import NO_POINTS, PointSet, lattice_of, points_of, reach_of, tables
+from .collision_shapes import lattice_of, tables
 from .rigid_motion import rigid_substep
+from .rigid_packing import RigidBody, RigidPacking, rigid_bodies_of
 from .surface_motion import Footing, footing_of
 
 Array = NDArray[np.float64]
 
 LEAST_RECOVERY = 1.0
-"""Speed of that correction without gravity, cells/s."""
-
-MOST_TOGETHER = 40
-"""Rigid bodies of a world up to which contacts that hold are solved together (``rigid_direct``): 0.5 MB and, where
-everything touches everything, 5 million operations."""
+"""Least speed at which depth is taken out of contacts, cells/s: that without gravity."""
 
 CHANGING = ("solids", "solid_kinds", "solid_numbers", "world_numbers", "memory")
 """The arrays that a checkpoint holds."""
+
+KINDS = {
+    "steps": ti.f64,
+    "world_spans": ti.i32,
+    "world_numbers": ti.f64,
+    "world_report": ti.f64,
+    "solid_kinds": ti.i32,
+    "solid_numbers": ti.f64,
+    "solids": ti.f64,
+    "impulses": ti.f64,
+    "clusters": ti.f32,
+    "cluster_starts": ti.i32,
+    "points": ti.f32,
+    "pairs": ti.i32,
+    "pair_numbers": ti.f64,
+    "counts": ti.i32,
+    "contacts": ti.f64,
+    "memory": ti.f64,
+    "reaches": ti.f64,
+    "scores": ti.f64,
+    "chosen": ti.i32,
+    "systems": ti.f64,
+    "motions": ti.f32,
+    "shape_numbers": ti.f32,
+    "shape_dims": ti.i32,
+    "distances": ti.f32,
+}
+"""Type of the elements of each array; ``kernel_arrays`` describes them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,20 +81,6 @@ class RigidPose:
     potential: float
 
 
-@dataclass(kw_only=True, eq=False)
-class _RigidBody:
-    """A rigid body or collider of one world, on the host."""
-
-    world: int
-    name: str
-    source: BodyParticles | Collider
-    center: Array
-    lattices: list[DistanceLattice]
-    points: PointSet
-    shape: int = 0
-    motions: tuple[NDArray[np.float32], ...] = ()
-
-
 class RigidBodies:
     """The rigid bodies (in the order of the setup), then the colliders of each world, and their contact pairs.
 
@@ -91,188 +100,25 @@ class RigidBodies:
         self.setups = tuple(setups)
         self.scales = tuple(float(scale) for scale in scales)
         self.origins = np.asarray(origins, dtype=np.float64)
-        self._rigid_bodies: list[_RigidBody] = []
         self._baked: dict[tuple[int, float], tuple[DistanceLattice, Footing]] = {}
         self._segments: dict[int, tuple[float, float]] = {}
         self._keys_done = np.full(len(setups), -np.inf)
         self.asleep: set[tuple[int, str]] = set()
         self.arrays: dict[str, ti.Ndarray] = {}
-        spans = []
-        for w, setup in enumerate(self.setups):
-            first = len(self._rigid_bodies)
-            self._rigid_bodies += [self._new_body(w, body) for body in setup.bodies if body.rigid]
-            self._rigid_bodies += [self._new_collider(w, collider) for collider in setup.colliders]
-            spans.append((first, len(self._rigid_bodies)))
-        self._pack(spans)
+        self._rigid_bodies, spans = rigid_bodies_of(self.setups)
+        packing = RigidPacking(
+            setups=self.setups, scales=self.scales, origins=self.origins, bodies=self._rigid_bodies, spans=spans
+        )
+        self.solved_together = packing.solved_together()
+        for name, values in packing.rows().items():
+            self._put(name, values)
+        self._put_shapes({i: [rigid.lattices[0]] for i, rigid in enumerate(self._rigid_bodies) if rigid.lattices})
         self.set_segments(dict.fromkeys(range(len(self.setups)), (0.0, 1.0)))
 
-    # ---- packing ------------------------------------------------------------------------------------------------
+    # ---- arrays -------------------------------------------------------------------------------------------------
 
-    def _new_body(self, w: int, body: BodyParticles) -> _RigidBody:
-        assert body.surface is not None
-        center = np.asarray(mass_properties(body.positions, body.masses, volumes=body.volumes).center)
-        return _RigidBody(
-            world=w,
-            name=body.name,
-            source=body,
-            center=center,
-            lattices=[lattice_of(body.surface)],
-            points=points_of(body.surface, center),
-        )
-
-    def _new_collider(self, w: int, collider: Collider) -> _RigidBody:
-        center = collider.middle
-        if collider.vertices is not None:
-            return _RigidBody(
-                world=w, name=collider.name, source=collider, center=center, lattices=[], points=NO_POINTS
-            )
-        return _RigidBody(
-            world=w,
-            name=collider.name,
-            source=collider,
-            center=center,
-            lattices=[collider.lattice or lattice_of(collider.surface)],
-            points=points_of(collider.surface, center),
-        )
-
-    def _pack(self, spans: list[tuple[int, int]]) -> None:
-        worlds, count = len(self.setups), len(self._rigid_bodies)
-        kinds = np.zeros((max(count, 1), at.KINDS), dtype=np.int32)
-        numbers = np.zeros((max(count, 1), at.NUMBERS))
-        state = np.zeros((max(count, 1), at.STATE))
-        rows, balls, starts = [], [], [np.zeros(1, dtype=np.int64)]
-        shape = cluster = point = 0
-        for i, rigid in enumerate(self._rigid_bodies):
-            scale = self.scales[rigid.world]
-            points = rigid.points
-            layers = 2 if not rigid.lattices else 1
-            rigid.shape = shape
-            kinds[i, at.SHAPE], kinds[i, at.LAYERS] = shape, layers
-            kinds[i, at.CLUSTERS : at.CLUSTERS_END + 1] = cluster, cluster + points.hull, cluster + len(points.balls)
-            shape += layers
-            cluster += len(points.balls)
-            lengths = np.ones(at.POINT)
-            lengths[[0, 1, 2, 9, 10]] = scale
-            rows.append(points.rows * lengths)
-            balls.append(points.balls * scale)
-            starts.append(points.starts[1:] + point)
-            point += len(points.rows)
-            numbers[i, [at.RADIUS, at.SPACING, at.BULGE]] = (
-                np.array([points.radius, points.spacing, points.bulge]) * scale
-            )
-            if isinstance(rigid.source, Collider) and rigid.source.lattice is not None:
-                numbers[i, at.RADIUS] = max(points.radius, reach_of(rigid.source.lattice, rigid.center)) * scale
-            if isinstance(rigid.source, Collider) and rigid.source.vertices is not None:
-                farthest = np.linalg.norm(rigid.source.vertices.values - rigid.center, axis=2).max()
-                numbers[i, at.RADIUS] = float(farthest) * scale
-            state[i, at.X : at.X + 3] = (rigid.center - self.origins[rigid.world]) * scale
-            state[i, at.Q] = 1.0
-            state[i, at.R : at.R + 9] = np.eye(3).ravel()
-            if isinstance(rigid.source, BodyParticles):
-                self._pack_body(rigid.source, scale, self.origins[rigid.world], numbers[i], state[i])
-                kinds[i, at.KIND] = at.DYNAMIC
-            else:
-                moves = rigid.source.translations is not None or rigid.source.rotations is not None
-                moves = moves or rigid.source.vertices is not None
-                kinds[i, at.KIND] = at.KINEMATIC if moves else at.STATIC
-        pairs, pair_numbers, pair_spans = self._pairs(spans)
-        ends, starts_of, size = self._systems(spans)
-        self.solved_together = max(starts_of, default=-1) >= 0
-        world_spans = np.column_stack([spans, pair_spans, ends, starts_of]).astype(np.int32)
-        self._put("steps", np.zeros(worlds), ti.f64)
-        self._put("world_spans", world_spans, ti.i32)
-        self._put("world_numbers", self._world_numbers(), ti.f64)
-        self._put("world_report", np.zeros((worlds, at.REPORT)), ti.f64)
-        self._put("solid_kinds", kinds, ti.i32)
-        self._put("solid_numbers", numbers, ti.f64)
-        self._put("solids", state, ti.f64)
-        self._put("impulses", np.zeros((max(count, 1), 6)), ti.f64)
-        self._put("clusters", np.concatenate([*balls, np.zeros((1, 4))]), ti.f32)
-        self._put("cluster_starts", np.concatenate(starts), ti.i32)
-        self._put("points", np.concatenate([*rows, np.zeros((1, at.POINT))]), ti.f32)
-        self._put("pairs", pairs, ti.i32)
-        self._put("pair_numbers", pair_numbers, ti.f64)
-        self._put("counts", np.zeros(len(pairs)), ti.i32)
-        self._put("contacts", np.zeros(len(pairs) * at.SLOTS * at.ROW), ti.f64)
-        self._put("memory", np.zeros(len(pairs) * at.SLOTS * at.MEMORY), ti.f64)
-        self._put("reaches", np.zeros(len(pairs)), ti.f64)
-        self._put("scores", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.f64)
-        self._put("chosen", np.zeros(len(pairs) * at.BINS * at.CHOSEN), ti.i32)
-        self._put("systems", np.zeros(size), ti.f64)
-        self._put("motions", np.zeros(1), ti.f32)
-        self._put_shapes({i: [rigid.lattices[0]] for i, rigid in enumerate(self._rigid_bodies) if rigid.lattices})
-
-    def _systems(self, spans: list[tuple[int, int]]) -> tuple[list[int], list[int], int]:
-        """Of each world the first collider and the start of its equations, -1 for none; and the numbers of all."""
-        ends, starts, size = [], [], 0
-        for first, end in spans:
-            free = sum(isinstance(self._rigid_bodies[i].source, BodyParticles) for i in range(first, end))
-            together = 1 < free <= MOST_TOGETHER
-            ends.append(first + free)
-            starts.append(size if together else -1)
-            size += 36 * free * free + 18 * free + 12 if together else 0
-        return ends, starts, max(size, 1)
-
-    def _pack_body(self, body: BodyParticles, scale: float, origin: Array, numbers: Array, state: Array) -> None:
-        properties = mass_properties(body.positions, body.masses, volumes=body.volumes)
-        inertia = np.asarray(properties.inertia) * scale**2 * body.inertia_factor
-        numbers[at.INVERSE_MASS], numbers[at.MASS] = 1 / properties.mass, properties.mass
-        numbers[at.INERTIA : at.INERTIA + 9] = inertia.ravel()
-        numbers[at.INVERSE_INERTIA : at.INVERSE_INERTIA + 9] = np.linalg.inv(inertia).ravel()
-        numbers[at.GRAVITY_FACTOR : at.TETHER_STRING + 1] = body.forces.in_cells(scale, origin)
-        state[at.V : at.V + 3] = np.asarray(body.velocity) * scale
-        state[at.W : at.W + 3] = body.spin
-        state[at.L : at.L + 3] = inertia @ np.asarray(body.spin)
-        state[at.J : at.J + 9] = np.linalg.inv(inertia).ravel()
-
-    def _pairs(self, spans: list[tuple[int, int]]) -> tuple[NDArray[np.int32], Array, list[tuple[int, int]]]:
-        """Every body that can move freely against the plane and against all others, either way round."""
-        rows: list[tuple[int, int, int, int]] = []
-        laws: list[Array] = []
-        pair_spans = []
-        for w, (first, end) in enumerate(spans):
-            begin = len(rows)
-            bodies = [i for i in range(first, end) if isinstance(self._rigid_bodies[i].source, BodyParticles)]
-            if self.setups[w].ground is not None:
-                for i in bodies:
-                    rows.append((i, -1, -1, len(laws)))
-                    laws.append(self._law(w, self._rigid_bodies[i].name, GROUND_NAME))
-            for i in bodies:
-                for j in range(i + 1, end):
-                    p = len(rows)
-                    both = len(self._rigid_bodies[j].points.rows) > 0
-                    rows.append((i, j, p + 1 if both else -1, len(laws)))
-                    if both:
-                        rows.append((j, i, p, len(laws)))
-                    laws.append(self._law(w, self._rigid_bodies[i].name, self._rigid_bodies[j].name))
-            pair_spans.append((begin, len(rows)))
-        rows = rows or [(0, -1, -1, 0)]
-        return np.asarray(rows, dtype=np.int32), np.asarray(laws or [np.zeros(at.CONTACT)]), pair_spans
-
-    def _law(self, w: int, a: str, b: str) -> Array:
-        contact, scale = self.setups[w].contact(a, b), self.scales[w]
-        law = np.zeros(at.CONTACT)
-        law[at.KINETIC], law[at.STATIC_FRICTION] = contact.friction, contact.sticking
-        law[at.RESTITUTION], law[at.MODE] = contact.restitution, MODES.index(contact.mode)
-        law[at.LEVER] = contact.rolling_resistance * scale
-        law[at.ADHESION], law[at.ADHESION_REACH] = contact.adhesion * scale, contact.adhesion_reach * scale
-        return law
-
-    def _world_numbers(self) -> Array:
-        numbers = np.zeros((len(self.setups), at.WORLD))
-        for w, setup in enumerate(self.setups):
-            axes, offset = np.eye(3), 0.0
-            if setup.ground is not None:
-                normal = setup.ground.unit_normal
-                first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-                first /= np.linalg.norm(first)
-                axes = np.stack([first, np.cross(normal, first), normal])
-                offset = -float(setup.ground.heights(self.origins[w])) * self.scales[w]
-            numbers[w, at.PLANE : at.PLANE + 9] = axes.ravel()
-            numbers[w, at.OFFSET] = offset
-        return numbers
-
-    def _put(self, name: str, values: NDArray[np.generic], kind: object) -> None:
+    def _put(self, name: str, values: NDArray[np.generic]) -> None:
+        kind = KINDS[name]
         flat = np.ascontiguousarray(values).ravel().astype(ti.lang.util.to_numpy_type(kind))
         if name not in self.arrays or self.arrays[name].shape != flat.shape:
             self.arrays[name] = new_array(kind, flat.size)
@@ -287,9 +133,9 @@ class RigidBodies:
             rigid.lattices = lattices
             parts += [(lattice, rigid.center, self.scales[rigid.world]) for lattice in lattices]
         table = tables(parts)
-        self._put("shape_numbers", np.append(table.numbers, np.float32(1)), ti.f32)
-        self._put("shape_dims", np.append(table.dims, np.int32(2)), ti.i32)
-        self._put("distances", table.distances, ti.f32)
+        self._put("shape_numbers", np.append(table.numbers, np.float32(1)))
+        self._put("shape_dims", np.append(table.dims, np.int32(2)))
+        self._put("distances", table.distances)
 
     def _put_motions(self, kinds: NDArray[np.generic]) -> None:
         """Velocities of the surfaces that deform, and where those of each begin, in its row of ``kinds``."""
@@ -298,7 +144,7 @@ class RigidBodies:
             kinds[i, at.MOTION] = offset
             parts += [np.ravel(motion) * np.float32(self.scales[rigid.world]) for motion in rigid.motions]
             offset += sum(motion.size for motion in rigid.motions)
-        self._put("motions", np.concatenate(parts), ti.f32)
+        self._put("motions", np.concatenate(parts))
 
     # ---- finding ------------------------------------------------------------------------------------------------
 
@@ -367,16 +213,16 @@ class RigidBodies:
         for w, (start, end) in segments.items():
             self._keys_done[w] = start + SAME_TIME
             self._segments[w] = (start, end)
-        self._put("world_numbers", world, ti.f64)
+        self._put("world_numbers", world)
         if changed:
             self._put_shapes(changed)
             self._put_motions(kinds)
-        self._put("solid_kinds", kinds, ti.i32)
-        self._put("solid_numbers", numbers, ti.f64)
-        self._put("solids", state, ti.f64)
+        self._put("solid_kinds", kinds)
+        self._put("solid_numbers", numbers)
+        self._put("solids", state)
 
     def _set_body(
-        self, rigid: _RigidBody, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
+        self, rigid: RigidBody, start: float, end: float, kinds: NDArray[np.generic], numbers: Array, state: Array
     ) -> None:
         body, scale = rigid.source, self.scales[rigid.world]
         assert isinstance(body, BodyParticles)
@@ -390,7 +236,7 @@ class RigidBodies:
             if due:
                 state[at.V : at.V + 3] = body.velocity_keys.values[due[-1]] * scale
 
-    def _set_pose(self, rigid: _RigidBody, start: float, end: float, state: Array) -> None:
+    def _set_pose(self, rigid: RigidBody, start: float, end: float, state: Array) -> None:
         collider = rigid.source
         assert isinstance(collider, Collider)
         scale, origin = self.scales[rigid.world], self.origins[rigid.world]
@@ -446,7 +292,7 @@ class RigidBodies:
         steps = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(self.setups),))
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise InputError(f"dt is {dt!r}: give seconds above 0")
-        self._put("steps", steps, ti.f64)
+        self._put("steps", steps)
         for _ in range(substeps):
             for each in rigid_substep(together=self.solved_together):
                 each(self.bodies, *([self.shapes] if "shapes_points" in each.arguments else []), self.contacts)
