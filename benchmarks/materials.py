@@ -164,7 +164,7 @@ def world_of(
 
     held: it is held at its foot, and there is neither gravity nor ground.
     """
-    from physgen.sim.app.scene_to_world import engine_material
+    from physgen.sim.app.scene_bodies import engine_material
     from physgen.sim.mpm.bodies import BodyParticles
     from physgen.sim.mpm.colliders import Surface
     from physgen.sim.mpm.geometry.interior_sampling import sample_interior

@@ -70,7 +70,7 @@ def ours(
     points: Points, cell: float, seconds: float, max_step: float, cache_folder: Path | None
 ) -> tuple[dict[str, Any], Points]:
     """Let the column fall in this project's engine; return its figures and the last positions."""
-    from physgen.sim.app.scene_to_world import engine_material
+    from physgen.sim.app.scene_bodies import engine_material
     from physgen.sim.mpm.bodies import BodyParticles
     from physgen.sim.mpm.solver_options import SolverOptions
     from physgen.sim.mpm.world import World

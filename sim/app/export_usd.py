@@ -35,7 +35,7 @@ from ..scene.scene_object import SceneObject
 from ..scene.shading import evenly_lit_mesh
 from ..scene.textured_mesh import TexturedMesh
 from .export_patch import prim_name
-from .scene_to_world import surface
+from .scene_contacts import surface
 from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..events import StageProgress
 from ..mpm.world import World
-from .scene_to_world import PreparedWorld, cost_text, engine_material, steps_text
+from .scene_bodies import engine_material
+from .scene_to_world import PreparedWorld, cost_text, steps_text
 from .scene_to_world_checks import moves, vertices_at
 
 __all__ = ["ENGINE_NAME", "Simulation", "build_world", "engine_material"]

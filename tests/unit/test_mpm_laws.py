@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.app.scene_to_world import engine_material
+from physgen.sim.app.scene_bodies import engine_material
 from physgen.sim.constitutive import (
     ElasticMaterial,
     FluidMaterial,

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from physgen.sim.app.bake_estimate import estimate_bake
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
-from physgen.sim.app.scene_to_world import contact_table
+from physgen.sim.app.scene_contacts import contact_table
 from physgen.sim.app.scene_to_world_checks import BOX_BODIES, cell_size, vertices_at
 from physgen.sim.constitutive import RigidMaterial
 from physgen.sim.errors import InputError

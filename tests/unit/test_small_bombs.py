@@ -14,7 +14,8 @@ import pytest
 import trimesh
 from physgen.batch.farm.planning.job_file import load_job
 from physgen.sim import atomic
-from physgen.sim.app.scene_to_world import _colliders, contact_table
+from physgen.sim.app.scene_bodies import colliders_of
+from physgen.sim.app.scene_contacts import contact_table
 from physgen.sim.cache.bake_folder import BakedObject, free_bake, save_manifest
 from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.diagnose.capture import load_capture
@@ -220,10 +221,10 @@ def test_vertex_tracks_together_are_bounded(ball_scene, monkeypatch):
         assert len(load_vertex_track(scene.root / name, len(mesh.vertices))[0]) == 2
         moved = dataclasses.replace(item, role="collider", velocity=(0.0, 0.0, 0.0), motion=Motion(vertices_file=name))
         items.append((moved, mesh))
-    assert len(_colliders(scene, items)) == 2
-    monkeypatch.setattr("physgen.sim.app.scene_to_world.MOST_TRACKS_BYTES", 40_000)
+    assert len(colliders_of(scene, items)) == 2
+    monkeypatch.setattr("physgen.sim.app.scene_bodies.MOST_TRACKS_BYTES", 40_000)
     with pytest.raises(InputError, match="ball1: the vertex tracks up to its own take more"):
-        _colliders(scene, items)
+        colliders_of(scene, items)
 
 
 def test_a_job_makes_a_bounded_number_of_simulations(tmp_path, monkeypatch):

@@ -317,7 +317,7 @@ def _density(item: SceneObject) -> float:
 
 def _contacts(scene: SceneModel) -> ContactTable:
     # Imported here: it pulls in the preparation of worlds, which reading the options does not need.
-    from ...app.scene_to_world import contact_table
+    from ...app.scene_contacts import contact_table
 
     return contact_table(scene)
 
