@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..work import Work
+from .contact_uncertainty import weight_contacts
 from .multiple_shooting import Fit, solve
 from .observed_poses import TOUCHED, ObservedBody, frame_pose, observe_body, turns_on_a_face
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, tether_numbers
@@ -22,7 +23,7 @@ from .rigid_misfit import misfit
 from .rigid_simulator import RigidWorlds, on_its_rim, rigid_body
 from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem
 from .start_numbers import missing_forces, tether_start
-from .state_tracking import initial_camera, track_states, weight_contacts
+from .state_tracking import initial_camera, track_states
 
 Array = NDArray[np.float64]
 

@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Initial states and nodes of a trial: the nominal model tracks the observations from contact to contact.
-
-``ContactUncertainty`` is how far a contact model can be trusted. Two simulators with the same coefficients differ by a
-share of the impulse exchanged, because they resolve a contact of a few milliseconds in different steps; a face or an
-edge that lands flat differs by more than a sphere."""
+"""Initial states and nodes of a trial: the nominal model tracks the observations from contact to contact."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +15,6 @@ from .multiple_shooting import eliminate_states
 from .observed_poses import (
     PUSHED,
     QUATERNION,
-    RUBBED,
     SPIN,
     TOUCHED,
     VELOCITY,
@@ -31,79 +25,10 @@ from .observed_poses import (
 )
 from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
-from .rigid_simulator import RigidBody, RigidWorlds
+from .rigid_simulator import RigidWorlds
 from .shooting_problem import Model, Problem, Segment, SegmentedTrial
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ContactUncertainty:
-    """Standard deviations. blow: relative, of an impact's impulse; rub: relative, of friction's; late: s, of impact
-    duration; floor_speed: m/s, floor_shift: m, of every contact. blow, rub and late depend on the body's shape."""
-
-    blow: float
-    tangential: float
-    late: float
-    floor_speed: float = 1.5e-3
-    floor_shift: float = 5e-5
-
-
-ROUND = ContactUncertainty(blow=0.006, tangential=0.02, late=2.5e-4)
-CORNERED = ContactUncertainty(blow=0.03, tangential=0.04, late=3e-4)
-
-
-def contact_uncertainty(body: RigidBody) -> ContactUncertainty:
-    """Return the contact uncertainty for the body's shape."""
-    return ROUND if body.round else CORNERED
-
-
-def contact_spread(
-    uncertainty: ContactUncertainty, body: RigidBody, record: Array, weight: float
-) -> tuple[Array, Array]:
-    """Return standard deviations of speed (F,) m/s and position (F,) m from the contacts in ``record`` (F, 17).
-
-    weight: nominal gravity normal to the ground, m/s², whose impulse on a resting body is no impact.
-    """
-    touched = record[:, TOUCHED]
-    blow = np.maximum(record[:, PUSHED] - weight * touched, 0.0)
-    speed = np.hypot(uncertainty.blow * blow, uncertainty.tangential * record[:, RUBBED])
-    speed = np.hypot(speed, uncertainty.floor_speed * (touched > 0))
-    place = np.hypot(uncertainty.late * blow, uncertainty.floor_shift * (touched > 0))
-    return speed, place
-
-
-def segment_covariance(
-    uncertainty: ContactUncertainty, body: RigidBody, record: Array, times: Array, weight: float
-) -> Array:
-    """Return the covariance (12, 12) of the state at the end of a segment: ``record`` (F, 17) at ``times`` (F,) s."""
-    speed, place = contact_spread(uncertainty, body, record, weight)
-    # An error made during the segment keeps moving the body.
-    made = np.diff(np.concatenate([[0.0], speed**2]))
-    since = times[-1] - np.concatenate([[times[0]], times[:-1]])
-    moved = np.sqrt(np.sum(np.maximum(made, 0.0) * since**2) / 3) + place[-1] + 2e-5
-    size = body.bound
-    turn = 1.0 if body.round else 1.5
-    spin = turn * speed[-1] / size + 1e-3
-    deviations = np.repeat([moved, moved * turn / size + 1e-4, speed[-1] + 2e-4, spin], 3)
-    return np.diag(deviations**2)
-
-
-def frame_weights(
-    uncertainty: ContactUncertainty, body: RigidBody, record: Array, times: Array, weight: float, info: Array
-) -> Array:
-    """Return the weights (F,) of a segment's frames. info: (F, 6, 6) on the pose, reduced by contact uncertainty."""
-    speed, place = contact_spread(uncertainty, body, record, weight)
-    made = np.maximum(np.diff(np.concatenate([[0.0], speed**2])), 0.0)
-    before = np.concatenate([[times[0]], times[:-1]])
-    since = np.maximum(times[:, None] - before[None], 0.0)
-    moved = np.sqrt(np.sum(made[None] * since**2, axis=1) / 3) + place
-    after = np.cumsum(moved > 0)
-    # The same error affects all later frames, which limits their combined information.
-    known = np.trace(info[:, :3, :3], axis1=1, axis2=2) / 3
-    together = np.cumsum(np.where(moved > 0, known, 0.0))
-    total = together[-1] if after[-1] else 0.0
-    return np.where(moved > 0, 1.0 / (1.0 + total * moved**2), 1.0)
 
 
 SEEN_FIRST = 0.05
@@ -265,50 +190,53 @@ def track_states(
         look = problem.evaluate(model, numbers, [here[i].states for i in active], slopes=False)
         going = []
         for segment, i in zip(look.segments, active, strict=True):
-            trial, node = trials[i], here[i].nodes[0]
-            if len(trial.states) < len(trial.nodes):
-                trial.states = np.concatenate([trial.states, here[i].states])
-            else:
-                trial.states = here[i].states.copy()
-            index = _next_node(trial.observations.times[node : trial.end], segment.record)
-            lost = _lost(trial.observations, segment)
-            if lost is not None and (index is None or lost < index):
-                # The model lost the body: restart where it is.
-                guess, prior = first_state(scene, trial.observations, node + lost)
-                trial.nodes.append(node + lost)
-                here[i] = SegmentedTrial(
-                    observations=trial.observations,
-                    nodes=[node + lost],
-                    states=guess[None],
-                    end=trial.end,
-                    guess=guess,
-                    prior=prior,
-                )
+            following = _following(scene, trials[i], here[i], segment)
+            if following is not None:
+                here[i] = following
                 going.append(i)
-                continue
-            if index is None:
-                continue
-            guess = segment.record[index, :13].copy()
-            blow = 0.2 * segment.record[index, 13] + 0.05
-            size = scene.body.bound
-            prior = np.repeat([0.01, 0.01 / size, blow, blow / size], 3)
-            if not trial.observations.poses_alone:
-                prior[3:6] = 1e-3
-                prior[9:12] = blow / size if trial.observations.hides_spin else STILL_SPIN
-            trial.nodes.append(node + index)
-            here[i] = SegmentedTrial(
-                observations=trial.observations,
-                nodes=[node + index],
-                states=guess[None],
-                end=trial.end,
-                guess=guess,
-                prior=prior,
-            )
-            going.append(i)
         active = going
     for trial in trials:
         trial.nodes = trial.nodes[: len(trial.states)]
     return trials
+
+
+def _following(
+    scene: BodyScene, trial: SegmentedTrial, here: SegmentedTrial, segment: Segment
+) -> SegmentedTrial | None:
+    """Give ``trial`` the states of ``here``, its last segment so far, and the node at which the next one begins.
+
+    Returns that one, to be fitted; None where ``segment``, a run of the last, lasts to the end.
+    """
+    node = here.nodes[0]
+    if len(trial.states) < len(trial.nodes):
+        trial.states = np.concatenate([trial.states, here.states])
+    else:
+        trial.states = here.states.copy()
+    index = _next_node(trial.observations.times[node : trial.end], segment.record)
+    lost = _lost(trial.observations, segment)
+    if lost is not None and (index is None or lost < index):
+        # The model lost the body: restart where it is.
+        index = lost
+        guess, prior = first_state(scene, trial.observations, node + lost)
+    elif index is None:
+        return None
+    else:
+        guess = segment.record[index, :13].copy()
+        blow = 0.2 * segment.record[index, PUSHED] + 0.05
+        size = scene.body.bound
+        prior = np.repeat([0.01, 0.01 / size, blow, blow / size], 3)
+        if not trial.observations.poses_alone:
+            prior[3:6] = 1e-3
+            prior[9:12] = blow / size if trial.observations.hides_spin else STILL_SPIN
+    trial.nodes.append(node + index)
+    return SegmentedTrial(
+        observations=trial.observations,
+        nodes=[node + index],
+        states=guess[None],
+        end=trial.end,
+        guess=guess,
+        prior=prior,
+    )
 
 
 def _set_down(scene: BodyScene, simulator: RigidWorlds, trials: list[SegmentedTrial], model: Model, z: Array) -> None:
@@ -411,28 +339,6 @@ def _next_node(times: Array, record: Array) -> int | None:
         index = int(np.searchsorted(times, begins + wait))
     index = max(index, 3)
     return index if index < len(times) - 3 else None
-
-
-def weight_contacts(problem: Problem, model: Model, z: Array) -> None:
-    """Set covariances and weights of every segment of ``problem`` from the contacts in a run of ``model``."""
-    scene = problem.scene
-    uncertainty = contact_uncertainty(scene.body)
-    weight = float(np.linalg.norm(scene.capture.gravity))
-    states = [t.states for t in problem.trials]
-    look = problem.evaluate(model, z, states, slopes=False)
-    for trial in problem.trials:
-        trial.covers, trial.weights = [], []
-    for segment in look.segments:
-        trial = problem.trials[segment.trial]
-        a, b = trial.spans[segment.index]
-        record = np.concatenate([segment.record, segment.arrival[None]]) if b < trial.end else segment.record
-        times = trial.observations.times[a : a + len(record)]
-        trial.covers.append(segment_covariance(uncertainty, scene.body, record, times, weight))
-        _, _, info = trial.observations.information(
-            segment.record[:, :3], segment.record[:, QUATERNION], segment.frames
-        )
-        count = len(segment.frames)
-        trial.weights.append(frame_weights(uncertainty, scene.body, segment.record, times[:count], weight, info))
 
 
 def initial_camera(problem: Problem) -> Array:
