@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,52 +80,11 @@ def follow_plain_body(
     with Video(path) as source:
         info = source.info
     progress = StageProgress(on_event, STAGE, max(1, 2 * info.frames))
-    count = 0
-
-    def on_frame() -> None:
-        nonlocal count
-        count += 1
-        if cancelled():
-            raise Cancelled("tracking was cancelled; nothing was written")
-        if count % 10 == 0:
-            progress.report(min(count, max(1, 2 * info.frames)), path.name)
-
-    found = find_moving_regions(path, video.start_frame, video.end_frame, on_frame)
-    progress.report(max(1, 2 * info.frames), path.name)
-    if len(found.stamps) < LEAST_FRAMES:
-        raise InputError(
-            f"{path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
-        )
-    linked = link_regions(found)
-    paths = bodies(linked, found.faint)
-    if not any(found.regions):
-        raise InputError(f"{path}: nothing moves in it; check --start-frame and --end-frame")
-    chosen = [p for p in paths if p.freedom() > 0]
-    if not chosen:
-        raise InputError(
-            f"{path}: nothing moves through it as one body of its own; film it alone before a still background"
-        )
-    times, fresh, notes = true_times(found.stamps, found.change, info.fps, video.fps_override)
-    warnings = [notes] if notes else []
-    if found.to_background is not None:
-        warnings.append(f"the camera drifts by up to {found.drift:.1f} px; frames are aligned to the background")
-    if len(chosen) > 1 and chosen[1].freedom() > RIVAL * chosen[0].freedom():
-        x, y = chosen[0].middles[0] / found.scale
-        warnings.append(
-            f"more than one body moves; the one that begins at x = {x:.0f}, y = {y:.0f} px is followed: "
-            "--start-frame and --end-frame choose another"
-        )
-    regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
-    if len(regions) < LEAST_FRAMES:
-        raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
-    if body.kind != "ball" and (shown := shown_share(chosen[0], linked)) < LEAST_SHOWN:
-        raise InputError(
-            f"{path}: one region shows {100 * shown:.0f} % of the body, the rest looks like the background or comes in "
-            "pieces, so that its size gives no scale: film it before a background of another colour, or paint it"
-        )
-    seen_at = times[[r.frame for r in regions]]
+    found = _found_regions(video, max(1, 2 * info.frames), progress, cancelled)
+    followed = _followed(video, body, found, info.fps)
+    regions, warnings = followed.regions, list(followed.warnings)
     places = np.array([r.middle for r in regions]) / found.scale
-    clock, missing = with_missing_frames(seen_at, places)
+    clock, missing = with_missing_frames(followed.times, places)
     length_px, length, elevation, misfit = apparent_size(regions, body, item, found.scale)
     standing = float(-item.vertices[:, 2].min())
     view = understand_motion(
@@ -142,7 +102,8 @@ def follow_plain_body(
         item = body.capture_object(on_rim=True)
     path_px, box = places, None
     if view.kind == "surface" and body.kind == "box":
-        seen_so = _seen_as_box(regions, item, found.scale, (info.width, info.height), seen_at, standing, str(path))
+        picture = info.width, info.height
+        seen_so = _seen_as_box(regions, item, found.scale, picture, followed.times, standing, str(path))
         if seen_so is not None:
             view, box, path_px, clock, missing = seen_so
             misfit = 0.0
@@ -153,29 +114,10 @@ def follow_plain_body(
             f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
             "its scale is rough"
         )
-    last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
-    step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
-    kept = np.arange(view.first, last + 1, step)
-    part = np.arange(view.first, view.last + 1)
-    if box is not None:
-        kept, part = kept[box.sound[kept]], part[box.sound[part]]
-    if len(kept) < LEAST_FRAMES:
-        first, end = regions[int(kept[0])].frame, regions[int(kept[-1])].frame
-        raise InputError(
-            f"{path}: the body is seen in free motion in {len(kept)} frames, {first} to {end}; a motion needs "
-            f"{LEAST_FRAMES}: film it at a higher frame rate, with nothing in front of it"
-        )
+    kept, free = _samples(path, regions, clock, view, box)
     points = view.points[kept - view.first]
-    noise_of_centre = noise_px(path_px[part])
-    if body.kind in ("box", "mesh") and view.kind == "surface":
-        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], path_px[part]))
-    turns = None
-    if box is not None:
-        turns = box.turns[kept]
-        # What a turn that is a little wrong moves the middles of the faces by, sideways.
-        arm = 0.5 * float(np.mean(box.edges[:2])) * view.scale
-        aside = np.stack([box.turns[part] * arm, np.zeros(len(part))], axis=1)
-        noise_of_centre = max(noise_of_centre, wobble_px(clock[part], aside))
+    noise_of_centre = _centre_noise(body, view, clock[free], path_px[free], None if box is None else box.at(free))
+    turns = None if box is None else box.turns[kept]
     trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre, turns)
     capture = check_capture(
         Capture(
@@ -202,8 +144,117 @@ def follow_plain_body(
         places=places[kept],
         regions=tuple(regions[k] for k in kept),
         box=None if box is None else box.at(kept),
-        others=tuple(tuple(p.regions) for p in chosen[1:] if p.freedom() > RIVAL * chosen[0].freedom()),
+        others=followed.others,
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Followed:
+    """The body that moves most freely. regions: where it is seen whole, each in a frame of its own. times: (n,) s of
+    these. others: see ``VideoMotion``."""
+
+    regions: list[Region]
+    times: Array
+    warnings: tuple[str, ...]
+    others: tuple[tuple[Region, ...], ...]
+
+
+def _found_regions(video: VideoTrial, steps: int, progress: StageProgress, cancelled: IsCancelled) -> MovingRegions:
+    """Return the moving regions of ``video``; each frame is looked at twice, so it has ``steps`` of work."""
+    count = 0
+
+    def on_frame() -> None:
+        nonlocal count
+        count += 1
+        if cancelled():
+            raise Cancelled("tracking was cancelled; nothing was written")
+        if count % 10 == 0:
+            progress.report(min(count, steps), video.path.name)
+
+    found = find_moving_regions(video.path, video.start_frame, video.end_frame, on_frame)
+    progress.report(steps, video.path.name)
+    if len(found.stamps) < LEAST_FRAMES:
+        raise InputError(
+            f"{video.path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
+        )
+    return found
+
+
+def _followed(video: VideoTrial, body: BodyRequest, found: MovingRegions, fps: float) -> _Followed:
+    """Return the body that moves most freely in ``found``. fps: frame rate that the file claims.
+
+    Raises InputError where nothing moves, nothing moves as one body, or too little of it is seen.
+    """
+    path = video.path
+    linked = link_regions(found)
+    paths = bodies(linked, found.faint)
+    if not any(found.regions):
+        raise InputError(f"{path}: nothing moves in it; check --start-frame and --end-frame")
+    chosen = [p for p in paths if p.freedom() > 0]
+    if not chosen:
+        raise InputError(
+            f"{path}: nothing moves through it as one body of its own; film it alone before a still background"
+        )
+    times, fresh, notes = true_times(found.stamps, found.change, fps, video.fps_override)
+    warnings = [notes] if notes else []
+    if found.to_background is not None:
+        warnings.append(f"the camera drifts by up to {found.drift:.1f} px; frames are aligned to the background")
+    rivals = [p for p in chosen[1:] if p.freedom() > RIVAL * chosen[0].freedom()]
+    if rivals:
+        x, y = chosen[0].middles[0] / found.scale
+        warnings.append(
+            f"more than one body moves; the one that begins at x = {x:.0f}, y = {y:.0f} px is followed: "
+            "--start-frame and --end-frame choose another"
+        )
+    regions = [r for r in chosen[0].regions if not r.cut and fresh[r.frame]]
+    if len(regions) < LEAST_FRAMES:
+        raise InputError(f"{path}: the body is seen whole in {len(regions)} frames; a motion needs {LEAST_FRAMES}")
+    if body.kind != "ball" and (shown := shown_share(chosen[0], linked)) < LEAST_SHOWN:
+        raise InputError(
+            f"{path}: one region shows {100 * shown:.0f} % of the body, the rest looks like the background or comes in "
+            "pieces, so that its size gives no scale: film it before a background of another colour, or paint it"
+        )
+    return _Followed(
+        regions=regions,
+        times=times[[r.frame for r in regions]],
+        warnings=tuple(warnings),
+        others=tuple(tuple(p.regions) for p in rivals),
+    )
+
+
+def _samples(
+    path: Path, regions: list[Region], clock: Array, view: MotionView, box: BoxMotion | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the numbers of the ``regions`` that the capture keeps, and of all in free motion.
+
+    Raises InputError where too few are kept.
+    """
+    last = view.first + stopped_at(clock[view.first : view.last + 1], view.points)
+    step = max(1, math.ceil((last - view.first + 1) / MOST_FRAMES))
+    kept = np.arange(view.first, last + 1, step)
+    free = np.arange(view.first, view.last + 1)
+    if box is not None:
+        kept, free = kept[box.sound[kept]], free[box.sound[free]]
+    if len(kept) < LEAST_FRAMES:
+        first, end = regions[int(kept[0])].frame, regions[int(kept[-1])].frame
+        raise InputError(
+            f"{path}: the body is seen in free motion in {len(kept)} frames, {first} to {end}; a motion needs "
+            f"{LEAST_FRAMES}: film it at a higher frame rate, with nothing in front of it"
+        )
+    return kept, free
+
+
+def _centre_noise(body: BodyRequest, view: MotionView, clock: Array, path_px: Array, box: BoxMotion | None) -> float:
+    """Return the standard deviation in px of the centres ``path_px`` (n, 2) at ``clock`` (n,) s. box: at these."""
+    noise = noise_px(path_px)
+    if body.kind in ("box", "mesh") and view.kind == "surface":
+        noise = max(noise, wobble_px(clock, path_px))
+    if box is not None:
+        # What a turn that is a little wrong moves the middles of the faces by, sideways.
+        arm = 0.5 * float(np.mean(box.edges[:2])) * view.scale
+        aside = np.stack([box.turns * arm, np.zeros(len(clock))], axis=1)
+        noise = max(noise, wobble_px(clock, aside))
+    return noise
 
 
 def _seen_as_box(
