@@ -167,3 +167,39 @@ def test_a_wing_of_the_shaded_ground_s_colour_is_kept_and_the_shadow_below_is_no
     assert mask[wing].mean() > 0.95
     assert mask[shadow].mean() < 0.1
     assert overlap(mask, body) > 0.95
+
+
+def shoe(seed, *, lined):
+    """A cream shoe on asphalt; its opening (h, w) within a pale rim is lined in the asphalt's grey, but smooth,
+    or shows asphalt."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    grain = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 0.8)
+    image = np.full((HEIGHT, WIDTH, 3), (108.0, 107, 110)) + 28.0 * (grain / grain.std())[..., None]
+    body = ((columns - 160) / 95) ** 2 + ((rows - 130) / 50) ** 2 < 1
+    opening = ((columns - 120) / 42) ** 2 + ((rows - 88) / 22) ** 2 < 1
+    image[body] = (214, 204, 186)
+    if lined:
+        rim = ndimage.binary_dilation(opening, iterations=8) & ~body
+        image[rim] = (230, 228, 224)
+        image[opening] = (104, 103, 106)
+    else:
+        image[opening & body] = np.roll(image, 110, axis=0)[opening & body]
+    image += rng.normal(scale=1.0, size=(HEIGHT, WIDTH, 1))
+    return finished(image), body, opening
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_smooth_lining_of_the_asphalt_s_grey_belongs_to_the_shoe(seed):
+    photo, body, opening = shoe(seed, lined=True)
+    mask = segment(photo, (52, 52, 268, 194), "shoe")
+    assert mask[opening].mean() > 0.9
+    assert overlap(mask, body | opening) > 0.93
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_asphalt_in_a_bay_of_a_shoe_stays_asphalt(seed):
+    photo, body, opening = shoe(seed, lined=False)
+    mask = segment(photo, (52, 52, 268, 194), "shoe")
+    assert mask[opening].mean() < 0.15
+    assert overlap(mask, body & ~opening) > 0.9

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite.srgb import cielab
-from .mask_geometry import Mask
+from .mask_geometry import Mask, shrunk
 
 Box = tuple[int, int, int, int]
 
@@ -18,6 +18,9 @@ TEXTURE = 0.8
 """Weight of the local standard deviation of lightness relative to lightness."""
 FINE = 560
 """Longest side in pixels of the copy on which gaps, rods and the ends of limbs are searched."""
+SMOOTHER, LEAST_TEXTURE, LEAST_SEEN = 0.7, 0.03, 10
+"""Texture of a part over nearly the smoothest of the ground, below which it is no ground, and pixels from which that is
+known; texture over lightness from which ground is rough enough to tell. A shoe's lining on asphalt has 0.55."""
 EDGE = 3.0
 """Gradient of an edge, in CIELAB units per pixel."""
 
@@ -61,21 +64,36 @@ def crop_around_box(
 ) -> BoxCrop:
     """Return the ``BoxCrop`` of a small copy ``pixels`` (h, w, 3)."""
     empty = np.zeros(pixels.shape[:2], dtype=bool)
-    lab = cielab(pixels, blur=0.8)
-    light = cielab(pixels)[..., 0]
-    mean = cv2.GaussianBlur(light, (0, 0), 2.0)
-    spread = np.sqrt(np.maximum(cv2.GaussianBlur(light**2, (0, 0), 2.0) - mean**2, 0.0))
-    # An edge between two plain surfaces is not texture: use the calmest window around each pixel.
-    calm = cv2.erode(spread, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9)))
     return BoxCrop(
         pixels,
-        lab,
-        np.asarray(TEXTURE * calm, dtype=np.float32),
+        cielab(pixels, blur=0.8),
+        np.asarray(TEXTURE * texture_of(cielab(pixels)[..., 0]), dtype=np.float32),
         box,
         others,
         empty if keep is None else keep,
         empty if drop is None else drop,
     )
+
+
+def texture_of(lightness: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the local deviation (h, w) of ``lightness`` (h, w), CIELAB, in the calmest window around each pixel: an
+    edge between two plain surfaces is not texture."""
+    mean = cv2.GaussianBlur(lightness, (0, 0), 2.0)
+    spread = np.sqrt(np.maximum(cv2.GaussianBlur(lightness**2, (0, 0), 2.0) - mean**2, 0.0))
+    return np.asarray(cv2.erode(spread, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))), dtype=np.float32)
+
+
+def is_smoother(lightness: NDArray[np.float32], part: Mask, ground: Mask) -> bool:
+    """Return whether ``part`` (h, w) has less texture than nearly all of the ``ground`` (h, w), lit as it is.
+
+    lightness: (h, w) CIELAB. False for parts too small to tell, and on smooth ground.
+    """
+    inner = shrunk(part, 2)
+    if inner.sum() < LEAST_SEEN or not ground.any():
+        return False
+    texture = texture_of(lightness) / (lightness + 16.0)
+    least = float(np.quantile(texture[ground], 0.1))
+    return least > LEAST_TEXTURE and float(np.median(texture[inner])) < SMOOTHER * least
 
 
 def edge_strength(lab: NDArray[np.float32]) -> NDArray[np.float32]:

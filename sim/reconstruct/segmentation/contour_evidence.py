@@ -71,7 +71,7 @@ def completed_by_contours(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask
         return Completed(mask, nothing, nothing)
     regions = thick_regions(view.pixels, max(20, int(0.004 * mask.sum())))
     crest = edge_crest(edge_strength(view.lab))
-    result, doubtful = _with_bays(view, mask, regions, crest), nothing.copy()
+    result, doubtful = _with_bays(view, _with_bays(view, mask, regions, crest), regions, crest), nothing.copy()
     for _ in range(3):
         best: tuple[float, Mask] | None = None
         doubtful, near = nothing.copy(), grown(result, SEAM)

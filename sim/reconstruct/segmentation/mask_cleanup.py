@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from skimage.segmentation import watershed
 
 from ...composite.srgb import cielab
+from .box_crop import is_smoother
 from .mask_geometry import enclosed_holes, largest_component, shrunk, touching
 
 Mask = NDArray[np.bool_]
@@ -112,8 +113,8 @@ def see_through(
     """Return the connected parts of ``regions`` through which the background shows.
 
     Most of their pixels (``share``, 0 to 1) look like the ground beside the object at about the same height, within
-    ``likeness`` (CIELAB delta E), and they are wider than a letter printed on a cover. slots: also narrow and long
-    ones, of half of that likeness.
+    ``likeness`` (CIELAB delta E), they are as rough as it, and wider than a letter printed on a cover. slots: also
+    narrow and long ones, of half of that likeness.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(regions.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
@@ -140,7 +141,10 @@ def see_through(
         distances = cKDTree(near).query(inside)[0]
         apart = float(np.linalg.norm(np.median(near, axis=0) - np.median(inside, axis=0)))
         if (distances < like).mean() > share and apart < 1.5 * like and _as_beside(lab, region, ring):
-            result |= region
+            beside = np.zeros_like(mask)
+            beside[rows] = ring[rows]
+            if not is_smoother(lab[..., 0], region, beside):
+                result |= region
     return result
 
 

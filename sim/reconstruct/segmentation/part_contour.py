@@ -17,7 +17,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.segmentation import felzenszwalb
 
-from .box_crop import BoxCrop
+from ...composite.srgb import cielab
+from .box_crop import BoxCrop, is_smoother
 from .mask_geometry import Mask, grown, ring_around, shrunk
 
 CREST = 2.5
@@ -108,7 +109,8 @@ def is_shade_of(colour: NDArray[np.floating], ground: NDArray[np.floating]) -> b
 
 
 def shows_ground(view: BoxCrop, part: Mask, mask: Mask) -> bool:
-    """Return whether ``part`` (h, w) has the colours of the background at its height, beside ``mask`` (h, w)."""
+    """Return whether ``part`` (h, w) has the colours of the background at its height, beside ``mask`` (h, w), and is
+    not smoother than any of it."""
     size = float(np.sqrt(mask.sum()))
     reach = max(3, round(0.25 * size))
     rows, margin = np.flatnonzero(part.any(axis=1)), round(0.08 * size)
@@ -116,7 +118,7 @@ def shows_ground(view: BoxCrop, part: Mask, mask: Mask) -> bool:
     strip = np.zeros_like(mask)
     strip[max(0, rows[0] - margin) : rows[-1] + 1 + margin, max(0, columns[0] - reach) : columns[-1] + reach] = True
     near = strip & ~grown(mask, 3) & ~view.others
-    if near.sum() < 30:
+    if near.sum() < 30 or is_smoother(cielab(view.pixels)[..., 0], part, near):
         return False
     outside, own = view.lab[near], view.lab[part]
     outside, own = outside[:: max(1, len(outside) // 500)], own[:: max(1, len(own) // 300)]
