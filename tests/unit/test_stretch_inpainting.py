@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.sim.composite.inpaint import FillOptions
 from physgen.sim.reconstruct.background.background_inpainting import GROUND_WAYS, PHOTO_WAYS
-from physgen.sim.reconstruct.background.inpainting_methods import BY_STRETCHES, InpaintingTask
+from physgen.sim.reconstruct.background.inpainting_methods import BY_STRETCHES, InpaintingTask, lay_grain
 from physgen.sim.reconstruct.background.method_choice import choose_method
 from physgen.sim.reconstruct.background.stretch_inpainting import fill_stretches
 from physgen.sim.reconstruct.background.texture_prediction import stretches
@@ -91,3 +91,28 @@ def test_stretches_never_overlap_and_copy_known_pixels_only(height, width, seed,
         assert not (stretch.there & ~hole).any()
         assert stretch.copied(source)[stretch.there].all()
         covered |= stretch.new
+
+
+def most_alike(detail, pattern):
+    """Largest correlation of ``pattern`` with a part of ``detail`` of its size, at any place."""
+    found = cv2.matchTemplate(detail.astype(np.float32), pattern.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+    return float(found.max())
+
+
+@pytest.mark.parametrize("tree", [False, True])
+def test_bark_is_not_laid_as_grain_into_grass(tree):
+    """A tree's bark was seen in green where a boot had stood beside it."""
+    big = cv2.resize(np.tile(grass(3), (2, 2, 1)), (640, 400))
+    if tree:
+        big[:, 430:560] *= np.float32(2.5)
+    hole = np.zeros(big.shape[:2], bool)
+    hole[90:310, 120:340] = True
+    smooth = np.where(hole[..., None], cv2.GaussianBlur(big, (0, 0), 4.0), big)
+    laid = lay_grain(smooth, hole, ~hole)
+    detail, given = (
+        picture.mean(axis=-1) - cv2.GaussianBlur(picture.mean(axis=-1), (0, 0), 1.5) for picture in (laid, big)
+    )
+    inside = detail[90:310, 120:340]
+    # Grass alone has its grain from beside the hole; with a tree there, nothing of that comes over.
+    alike = max(most_alike(inside, given[r : r + 60, c : c + 60]) for r in (120, 180, 240) for c in (440, 480))
+    assert (alike > 0.7) != tree

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...scene.model import Camera
 from .relit_ground import near_any, smoothed
-from .stretch_inpainting import fill_stretches
+from .stretch_inpainting import fill_stretches, is_even
 from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
 from .texture_prediction import stretches
 from .top_view import to_photo, to_top_view, top_views, visible_in_photo
@@ -111,7 +111,8 @@ def _with_grain(picture: Picture, hole: Mask, known: Mask, side: float, blur: fl
     light = detail[inner].mean(axis=-1)
     grain = 1.4826 * np.median(np.abs(light))
     share = float(np.clip((grain / max(float(light.std()), 1e-3) - GRAINY[0]) / (GRAINY[1] - GRAINY[0]), 0.0, 1.0))
-    if share == 0.0:
+    # Beside several surfaces, such as grass with a tree behind it, the bark would be seen in the grass.
+    if share == 0.0 or not is_even(picture, known, side, float(light.std())):
         return match_grain(picture, hole, known)
     # Single spots and edges would be seen twice.
     source, laid = np.clip(detail, -4.0 * grain, 4.0 * grain), detail.copy()

@@ -56,9 +56,17 @@ def is_irregular(picture: Picture, hole: Mask, barred: Mask) -> bool:
     detail = (logs - smoothed(logs, known, fine)).mean(axis=-1)[inner]
     spread = float(detail.std())
     grain = 1.4826 * float(np.median(np.abs(detail - np.median(detail))))
-    level = smoothed(logs, known, max(1.0, COARSE * side)).mean(axis=-1)
+    return grain > GRAINY * spread and is_even(logs, known, side, spread)
+
+
+def is_even(values: Picture, known: Mask, side: float, spread: float) -> bool:
+    """Return whether the level of ``values`` (h, w, 3), where ``known`` (h, w), is the same all along each row.
+
+    side: of the hole, pixels. spread: deviation of the detail, with which that of the level is compared.
+    """
+    level = smoothed(values, known, max(1.0, COARSE * side)).mean(axis=-1)
     along = [float(row[seen].std()) for row, seen in zip(level, known, strict=True) if seen.sum() > FEWEST]
-    return bool(along) and grain > GRAINY * spread and float(np.mean(along)) < EVEN * spread
+    return bool(along) and float(np.mean(along)) < EVEN * spread
 
 
 def fill_stretches(picture: Picture, hole: Mask, barred: Mask, options: FillOptions) -> Picture:
