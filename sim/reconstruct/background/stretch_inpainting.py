@@ -26,6 +26,8 @@ MOST = 10
 """Most stretches of one hole."""
 LEVEL = 2.0
 """Cost of a stretch from other rows, over the photo's height: there blades are larger or smaller."""
+SEAM_PIXELS = 60_000
+"""Largest size of the copy on which seams are searched: of a million pixels it took 40 CPU seconds."""
 COST = 100.0
 """Scale of logarithms in the search for seams, whose costs are rounded."""
 
@@ -96,16 +98,27 @@ def _joined(found: list[Stretch], logs: Picture, hole: Mask) -> list[Mask]:
     if len(found) < 2:
         return [stretch.there for stretch in found]
     rows, columns = (slice(int(axis.min()), int(axis.max()) + 1) for axis in np.nonzero(hole))
-    copies = [np.ascontiguousarray(COST * item.copied(logs)[rows, columns], np.float32) for item in found]
-    masks = [255 * np.ascontiguousarray(item.there[rows, columns], np.uint8) for item in found]
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    scale = min(1.0, float(np.sqrt(SEAM_PIXELS / (height * width))))
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    copies, masks = [], []
+    for item in found:
+        copy = np.where(item.there[..., None], item.copied(logs), 0.0)[rows, columns].astype(np.float32)
+        share = cv2.resize(item.there[rows, columns].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        copies.append(COST * cv2.resize(copy, size, interpolation=cv2.INTER_AREA))
+        masks.append(255 * (share > 0.99).astype(np.uint8))
     # OpenCV's declared types know only its own matrices here.
     finder: Any = cv2.detail.GraphCutSeamFinder("COST_COLOR")
     cut = finder.find(copies, [(0, 0)] * len(found), masks)
-    parts = []
-    left = hole.copy()
-    for item in cut:
-        own = np.zeros_like(hole)
-        own[rows, columns] = np.asarray(item.get() if isinstance(item, cv2.UMat) else item) > 0
-        parts.append(own & left)
-        left &= ~own
+    small = np.full(size[::-1], -1, dtype=np.int16)
+    for index, item in enumerate(cut):
+        small[np.asarray(item.get() if isinstance(item, cv2.UMat) else item) > 0] = index
+    owner = np.full(hole.shape, -1, dtype=np.int16)
+    owner[rows, columns] = cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST)
+    parts = [stretch.there & (owner == index) for index, stretch in enumerate(found)]
+    # The border of a stretch lies within a cell of the copy: what is left there goes to the first that covers it.
+    left = hole & ~np.logical_or.reduce(parts)
+    for index, stretch in enumerate(found):
+        parts[index] |= stretch.there & left
+        left &= ~stretch.there
     return parts
