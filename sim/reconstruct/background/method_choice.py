@@ -35,10 +35,10 @@ DETAIL = 3.0
 """Penalty in decibels for details too strong or too weak by a factor e."""
 MORE = 0.3
 """Margin in decibels by which a method must beat those before it."""
-IRREGULAR = 2.5
-"""Decibels by which the best way may be ahead of a plain colour and of stretches, summed, on a surface that nothing
-foretells: there a true copy errs by twice the variance, 3 dB more than the mean, but has the right detail. Grass and
-asphalt had 0.1 to 2.0 dB, water, benches, rocks, tables and a floor 3.2 and more."""
+IRREGULAR = 5.0
+"""Decibels by which the best way may be ahead of a plain colour and of stretches, summed, on an irregular surface:
+there a true copy errs by twice the variance, 3 dB more than the mean, but has the right detail. Grass, asphalt and
+concrete had 0.1 to 3.1 dB; where it is more, the best way foretells the surface."""
 BEHIND = 3.0
 """Deficit in decibels at which a method is dropped after one trial."""
 
@@ -58,15 +58,13 @@ class MethodChoice:
 def choose_method(task: InpaintingTask, ways: Sequence[str]) -> MethodChoice:
     """Return the one of ``ways`` that does best around ``task``'s hole.
 
-    Stretches are tried on irregular surfaces only (``stretch_inpainting``). If no trial is possible they are used
-    there, and elsewhere the first.
+    Stretches are tried on irregular surfaces only (``stretch_inpainting``). If no trial is possible it is the first:
+    where so little is seen, the same narrow stretch would be copied again and again.
     """
     if BY_STRETCHES in ways:
-        others = tuple(way for way in ways if way != BY_STRETCHES)
         rows, columns = around(task)
-        irregular = is_irregular(task.picture[rows, columns], task.target[rows, columns], task.closed[rows, columns])
-        # The first is the one without a trial.
-        ways = (BY_STRETCHES, *others) if irregular else others
+        if not is_irregular(task.picture[rows, columns], task.target[rows, columns], task.closed[rows, columns]):
+            ways = tuple(way for way in ways if way != BY_STRETCHES)
     small = _smaller(task)
     trials = trial_holes(small.target, ~(small.closed | small.target))
     if not trials or len(ways) == 1:
