@@ -25,7 +25,7 @@ def grass(seed=0):
     picture = np.zeros((HEIGHT, WIDTH), np.float32)
     noise = rng.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
     for row in range(HEIGHT):
-        blur = 0.6 + 2.0 * row / HEIGHT
+        blur = 0.4 + 0.8 * row / HEIGHT
         blades = cv2.GaussianBlur(noise, (0, 0), sigmaX=blur, sigmaY=2.0 * blur)[row]
         picture[row] = blades / blades.std()
     return (np.array([60.0, 110.0, 40.0]) * np.exp(0.35 * picture)[..., None]).astype(np.float32)
@@ -71,6 +71,9 @@ def test_stretches_are_for_what_nothing_foretells():
     hole, nothing, ways = disc(150, 105, 40), np.zeros((HEIGHT, WIDTH), bool), PHOTO_WAYS + GROUND_WAYS
     view = camera_above_ground(WIDTH, HEIGHT, 350.0, math.radians(35.0))
     assert choose_method(InpaintingTask(grass(), hole, nothing, view, FillOptions()), ways).way == BY_STRETCHES
+    # Seams of soft clouds would be seen.
+    clouds = np.stack([cv2.GaussianBlur(channel, (0, 0), 4.0) for channel in np.moveaxis(grass(), -1, 0)], axis=-1)
+    assert choose_method(InpaintingTask(clouds, hole, nothing, view, FillOptions()), ways).way != BY_STRETCHES
     # A cloth with a check of lines that lie askew: copies would break them.
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     lines = ((rows + columns // 3) % 24 < 5) | ((columns - rows // 3) % 24 < 5)
