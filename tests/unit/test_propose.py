@@ -15,7 +15,7 @@ from physgen.sim.app.propose import LIST_FILE, PICTURE_FILE, best_proposals, cho
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.camera.vanishing_points import straight_lines
 from physgen.sim.reconstruct.reconstruct_options import Proposal
-from physgen.sim.reconstruct.segmentation.border_ownership import lightness_of, lines_go_on, sides_go_on
+from physgen.sim.reconstruct.segmentation.border_ownership import lines_go_on, sides_go_on
 from physgen.sim.reconstruct.segmentation.object_proposals import (
     LEFT_ASIDE,
     candidates,
@@ -25,6 +25,7 @@ from physgen.sim.reconstruct.segmentation.object_proposals import (
     with_the_rest_aside,
 )
 from physgen.sim.reconstruct.segmentation.outline_sharpness import in_focus, outline_width, sharp_as
+from physgen.sim.reconstruct.segmentation.proposal_features import lab_of
 from PIL import Image
 from scipy import ndimage
 
@@ -365,7 +366,7 @@ def test_a_gap_of_a_bench_lies_behind_its_slats_and_a_thing_on_it_does_not():
     picture, gap, rows, columns = bench()
     box = (np.abs(columns - 200) < 60) & (np.abs(rows - 220) < 50)
     picture[box] = (190.0, 90.0, 60.0)
-    lightness = lightness_of(np.clip(picture, 0, 255).astype(np.uint8))
+    lightness = lab_of(np.clip(picture, 0, 255).astype(np.uint8))[..., 0]
     assert sides_go_on(gap, lightness)
     assert not sides_go_on(box, lightness)
 
@@ -376,12 +377,12 @@ def test_a_thing_that_ends_at_one_line_owns_its_outline():
     picture[:] = np.where((rows < 120.0)[..., None], (200.0, 195.0, 190.0), (120.0, 90.0, 60.0))
     book = (np.abs(columns - 200) < 60) & (rows > 120) & (rows < 240)
     picture[book] = (50.0, 60.0, 150.0)
-    assert not sides_go_on(book, lightness_of(np.clip(picture, 0, 255).astype(np.uint8)))
+    assert not sides_go_on(book, lab_of(np.clip(picture, 0, 255).astype(np.uint8))[..., 0])
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (8, 8), (9, 400), (400, 9)])
 def test_plain_pictures_have_no_sides_that_go_on(shape):
-    plain = lightness_of(np.full((*shape, 3), 90, np.uint8))
+    plain = lab_of(np.full((*shape, 3), 90, np.uint8))[..., 0]
     assert not sides_go_on(np.ones(shape, bool), plain)
     assert not sides_go_on(np.zeros(shape, bool), plain)
 

@@ -37,15 +37,15 @@ MORE = 0.3
 """Margin in decibels by which a method must beat those before it."""
 IRREGULAR = 5.0
 """Decibels by which the best way may be ahead of a plain colour and of stretches, summed, on an irregular surface:
-there a true copy errs by twice the variance, 3 dB more than the mean, but has the right detail. Grass, asphalt and
-concrete had 0.1 to 3.1 dB; where it is more, the best way foretells the surface."""
+there a true copy errs by twice the variance, 3 dB more than the mean, but has the right detail. Grass and asphalt
+had 0.1 to 3.1 dB; where it is more, the best way foretells the surface."""
 BEHIND = 3.0
 """Deficit in decibels at which a method is dropped after one trial."""
 
 
 @dataclass(frozen=True)
 class MethodChoice:
-    """way: its name in ``WAYS``. scores: decibels of each that was tried, empty where no trial hole fits.
+    """way: its name in ``METHODS``. scores: decibels of each that was tried, empty where no trial hole fits.
 
     certain: decibels by which the best one beats a hole filled with the mean of its surroundings.
     """

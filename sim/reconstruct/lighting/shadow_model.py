@@ -168,7 +168,7 @@ def observed_darkening(ground: GroundPixels, left: Values) -> float:
     told, seen = (
         values - ground.blurred(values, sigma) for values in (np.log(np.maximum(left, 0.02)), ground.colour @ LUMINANCE)
     )
-    # Where nothing is told, nothing speaks against it.
+    # A shadow that claims no darkening is not contradicted: the ratio is 1 then.
     noise = len(told) * LEAST_STEP**2
     return float(((told * seen).sum() + noise) / (np.square(told).sum() + noise))
 

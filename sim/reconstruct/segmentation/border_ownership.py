@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import cielab
 from .mask_geometry import Mask, grown
 
 Values = NDArray[np.float64]
@@ -67,7 +66,7 @@ def lines_go_on(mask: Mask, lines: NDArray[np.float64]) -> bool:
 def sides_go_on(mask: Mask, lightness: NDArray[np.float32]) -> bool:
     """Return whether straight sides of ``mask`` (H, W) go on beyond both of their ends, so that it lies behind them.
 
-    lightness: (H, W) CIELAB, slightly smoothed.
+    lightness: (H, W) CIELAB, slightly smoothed, as of ``proposal_features.lab_of``.
     """
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not outlines:
@@ -120,8 +119,3 @@ def _goes_on(start: Values, end: Values, step: Values) -> bool:
         if whole.sum() < 8 or float(seen[whole].mean()) < GOES_ON:
             return False
     return True
-
-
-def lightness_of(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the lightness (H, W) of ``pixels`` (H, W, 3) sRGB for ``sides_go_on``."""
-    return np.asarray(cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 0.8), dtype=np.uint8))[..., 0])

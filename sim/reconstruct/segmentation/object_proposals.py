@@ -21,7 +21,7 @@ from skimage.segmentation import felzenszwalb, slic
 from ...composite.srgb import cielab
 from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
-from .border_ownership import lightness_of, lines_go_on, sides_go_on
+from .border_ownership import lines_go_on, sides_go_on
 from .box_crop import crop_around_box, edge_strength
 from .colour_models import ground_likelihood
 from .mask_geometry import Mask, extent_of, largest_component, largest_part, solidity_of
@@ -37,6 +37,7 @@ from .proposal_features import (
     copy_of,
     cut_share,
     features_of,
+    lab_of,
     score_of,
     share_on_edges,
 )
@@ -96,7 +97,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     found = [pair for pair, is_sharp in zip(found, sharp, strict=True) if is_sharp]
     shade, ground = FEATURES.index("shade"), FEATURES.index("ground")
     whole = whole_objects(
-        [Candidate(item.mask, value, bool(item.features[shade])) for item, value in found], _lab_of(small)
+        [Candidate(item.mask, value, bool(item.features[shade])) for item, value in found], lab_of(small)
     )
     across, down = pixels.shape[1] / size[0], pixels.shape[0] / size[1]
     result = []
@@ -122,7 +123,7 @@ def _owning(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[E
     """Those of ``found`` that own their outline in ``pixels`` (H, W, 3), see ``border_ownership``; all where none is
     left."""
     fine = copy_of(pixels, FINE)
-    lines, lightness = straight_lines(fine), lightness_of(fine)
+    lines, lightness = straight_lines(fine), lab_of(fine)[..., 0]
     kept = []
     for item, value in found:
         mask = at_size_of(item.mask, fine)
@@ -331,7 +332,7 @@ def _plausible(mask: Mask, height: int, width: int) -> bool:
 def examined_candidates(pixels: Pixels) -> list[Examined]:
     """Return the most promising candidates of the copy ``pixels`` (h, w, 3), segmented in their boxes."""
     height, width = pixels.shape[:2]
-    lab = _lab_of(pixels)
+    lab = lab_of(pixels)
     edges = edge_strength(lab)
     rough = [(mask, _promise(mask, lab, edges)) for mask in candidates(pixels)]
     rough.sort(key=lambda pair: -pair[1])
@@ -348,11 +349,6 @@ def examined_candidates(pixels: Pixels) -> list[Examined]:
         if found is not None and _plausible(found, height, width):
             result.append(Examined(found, features_of(found, mask, (value, ground), lab, edges)))
     return result
-
-
-def _lab_of(pixels: Pixels) -> NDArray[np.float32]:
-    """CIELAB (h, w, 3) of the copy, a little smoothed."""
-    return cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 0.8), dtype=np.uint8))
 
 
 def _promise(mask: Mask, lab: NDArray[np.float32], edges: NDArray[np.float32]) -> float:

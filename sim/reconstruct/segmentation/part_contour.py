@@ -2,7 +2,7 @@
 """The contour of a part beside a mask: what both share, and the edge and the colours along the rest of it.
 
 Neighbours that complete a plain figure, what fills a bay (``contour_evidence``) and the ends of limbs (``limb_ends``)
-are told from ground by the same measurements; each has bounds of its own.
+are distinguished from ground by the same measurements, each with its own thresholds.
 """
 
 from __future__ import annotations
@@ -118,12 +118,13 @@ def shows_ground(view: BoxCrop, part: Mask, mask: Mask) -> bool:
     strip = np.zeros_like(mask)
     strip[max(0, rows[0] - margin) : rows[-1] + 1 + margin, max(0, columns[0] - reach) : columns[-1] + reach] = True
     near = strip & ~grown(mask, 3) & ~view.others
-    if near.sum() < 30 or is_smoother(cielab(view.pixels)[..., 0], part, near):
+    if near.sum() < 30:
         return False
     outside, own = view.lab[near], view.lab[part]
     outside, own = outside[:: max(1, len(outside) // 500)], own[:: max(1, len(own) // 300)]
     apart = np.linalg.norm(np.median(outside, axis=0) - np.median(own, axis=0))
-    return bool(apart < 16.0 and (cKDTree(outside).query(own)[0] < 9.0).mean() > 0.7)
+    alike = bool(apart < 16.0 and (cKDTree(outside).query(own)[0] < 9.0).mean() > 0.7)
+    return alike and not is_smoother(cielab(view.pixels)[..., 0], part, near)
 
 
 def joined_with(mask: Mask, part: Mask) -> Mask:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...composite.srgb import cielab
 from .box_crop import edge_crest
 from .mask_geometry import Mask, extent_of, outline_of, ring_around, shrunk, solidity_of
 
@@ -26,6 +27,11 @@ def copy_of(pixels: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     scale = min(1.0, longest / max(pixels.shape[:2]))
     size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def lab_of(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return CIELAB (H, W, 3) of a copy ``pixels`` (H, W, 3) sRGB, a little smoothed."""
+    return cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 0.8), dtype=np.uint8))
 
 
 def at_size_of(mask: Mask, picture: NDArray[np.uint8]) -> Mask:
