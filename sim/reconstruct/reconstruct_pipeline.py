@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from ..atomic import write_json
 from ..errors import InputError
@@ -24,13 +23,12 @@ from ..scene.environment import write_environment
 from ..scene.equirectangular import Radiance
 from ..scene.folder import Scene, save_scene
 from ..scene.material import load_preset
-from ..scene.model import Camera, Ground, Light, SceneModel, SceneObject
+from ..scene.model import Camera, Ground, Light, SceneModel
 from ..scene.scene_output import PHYSICS_FILE, replacing_folder
 from ..trust import trusted_spec
 from .adapters.resolve import resolve
-from .appearance.appearance_estimate import ObjectAppearance, estimate_appearances
+from .appearance.appearance_estimate import estimate_appearances
 from .appearance.fur import is_furry
-from .camera import ground_camera as cameras
 from .camera.camera_estimate import CameraEstimate, estimate_camera, metres_per_unit
 from .camera.depth_map import DepthMap, read_depth
 from .lighting.ground_gloss import GroundGloss
@@ -47,111 +45,20 @@ from .reasoning.material_decision import (
     describe_decision,
     ground_friction,
     physics_record,
-    to_material,
 )
 from .reasoning.material_names import shipped_names
 from .reasoning.material_query import query_materials
 from .reconstruct_options import ObjectRequest, ReconstructOptions, object_names
 from .reconstruction_report import REPORT_FILE, ReportData, write_report
+from .scene_estimate import SceneEstimate, write_scene
+from .segmentation.box_crop import Box
 from .segmentation.object_masks import segment_objects
 from .segmentation.object_proposals import propose_boxes
-from .shape.body_texture import glb_bytes, world_from_gltf
 from .shape.object_bodies import Body, make_bodies, shadow_casters
 from .stage_cache import STAGES_FOLDER, Arrays, Notice, StageCache, Steps
 
 SEARCHED = 640
 """Longest side in pixels of the picture in which things are looked for whose sizes tell the camera."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneEstimate:
-    """The estimates that make a scene, lengths in the unit of ``view``; lists in the order of the objects.
-
-    metres: per unit. view: camera above z = 0.
-    """
-
-    pixels: NDArray[np.uint8]
-    layers: Layers
-    view: Camera
-    bodies: Sequence[Body]
-    metres: float
-    light: Light
-    looks: Sequence[ObjectAppearance]
-    gloss: GroundGloss
-
-
-def write_scene(
-    folder: Path,
-    found: SceneEstimate,
-    objects: Sequence[ObjectRequest],
-    physics: Sequence[ObjectPhysics],
-    friction: float,
-) -> SceneModel:
-    """Write all files except the light's and ``scene.json`` into ``folder``; return the scene that refers to them.
-
-    objects: with their names. physics: material of each. friction: of the ground.
-    """
-    names = [item.name or "" for item in objects]
-    layers = found.layers
-    for sub in ("masks", "shadows", "holes", "meshes", "albedo", "shading"):
-        (folder / sub).mkdir()
-    save_png(folder / "photo.png", found.pixels)
-    save_png(folder / "background.png", layers.background)
-    bases = [_base_centre(body) for body in found.bodies]
-    for i, name in enumerate(names):
-        for sub, layer in (("masks", layers.seen[i]), ("shadows", layers.shadows[i]), ("holes", layers.holes[i])):
-            save_png(folder / sub / f"{name}.png", layer.astype(np.uint8) * 255)
-        if (layers.full[i] != layers.seen[i]).any():
-            (folder / "full").mkdir(exist_ok=True)
-            save_png(folder / "full" / f"{name}.png", layers.full[i].astype(np.uint8) * 255)
-        surface, look = found.bodies[i].surface, found.looks[i]
-        if surface.shading is not None:
-            save_png(folder / "shading" / f"{name}.png", surface.shading)
-        save_png(folder / "albedo" / f"{name}.png", look.albedo)
-        content = glb_bytes(surface, bases[i], found.metres, roughness=look.roughness, metallic=look.metallic)
-        (folder / "meshes" / f"{name}.glb").write_bytes(content)
-    origin = bases[0] * (1.0, 1.0, 0.0)
-    return SceneModel(
-        camera=cameras.scaled_to_metres(found.view, origin, found.metres),
-        objects=tuple(
-            SceneObject(
-                name=name,
-                mesh=f"meshes/{name}.glb",
-                world_from_mesh=world_from_gltf((bases[i] - origin) * found.metres),
-                size_m=found.bodies[i].extent * found.metres,
-                material=to_material(physics[i]),
-                fill=physics[i].fill,
-                roughness=physics[i].roughness,
-                velocity=objects[i].velocity,
-                spin=objects[i].spin,
-                asleep=True,
-                occlusion_order=layers.front_to_back.index(i),
-                mask=f"masks/{name}.png",
-                shadow=f"shadows/{name}.png",
-                shading=None if found.bodies[i].surface.shading is None else f"shading/{name}.png",
-            )
-            for i, name in enumerate(names)
-        ),
-        ground=Ground(
-            friction=friction,
-            reflectivity=found.gloss.reflectivity,
-            reflection_roughness=found.gloss.roughness,
-        ),
-        light=found.light,
-    )
-
-
-def _base_centre(body: Body) -> NDArray[np.float64]:
-    """Centre (3,) of the part that rests on the ground or another object, in the body's unit."""
-    vertices = body.surface.vertices
-    bottom = float(vertices[:, 2].min())
-    low = vertices[vertices[:, 2] <= bottom + 1e-6 * np.ptp(vertices[:, 2]) + 1e-12]
-    return np.array([*((low[:, :2].min(axis=0) + low[:, :2].max(axis=0)) / 2.0), bottom])
-
-
-def save_png(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write ``pixels`` (H, W) or (H, W, 3) as a PNG."""
-    Image.fromarray(pixels).save(path, format="PNG", compress_level=4)
 
 
 Mask = NDArray[np.bool_]
@@ -189,70 +96,27 @@ def reconstruct_photo(
     steps = Steps(9 + 4 * len(objects) + options.report, on_event, cancelled)
     with replacing_folder(out) as folder:
         store = StageCache(folder / STAGES_FOLDER, out / STAGES_FOLDER, steps.notice)
-        steps.begin("photo")
-        picture = load_photo(photo, options.max_size)
-        if picture.scale < 1.0:
-            steps.notice(
-                f"photo of {picture.original_size[0]}x{picture.original_size[1]} pixels is processed at "
-                f"{picture.width}x{picture.height}; max_size changes that"
-            )
-        require_memory(
-            reconstruction_bytes(_box_pixels(picture, objects), len(objects)),
-            available_memory(RECONSTRUCTION_RESERVED),
-            what=f"{len(objects)} objects in a photo of {picture.width}x{picture.height} pixels",
-            remedy="scale the photo down",
-        )
+        picture = _working_photo(photo, objects, options, steps)
         objects = [_in_working_pixels(item, picture.scale) for item in objects]
+        run = _Run(picture=picture, objects=objects, options=options, store=store, steps=steps)
         seen, boxes = segment_objects(picture, objects, options, store, steps)
         steps.begin("physics")
-        if answered is not None and ask is None:
-            answers: Answers | None = read_answer(answered, len(names))
-        else:
-            answers = _asked(picture, seen, names, ask, store, steps)
+        answers = run.answers(seen, ask, answered)
         physics = decide_materials(objects, names, answers, shipped_names())
         # The kind of an object determines its shape as well.
         objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
+        run = replace(run, objects=objects)
         steps.begin("camera")
-        depth = _depth(picture, options, steps)
+        depth = run.depth()
         estimate = estimate_camera(
             picture, seen, options, depth, steps.notice, lambda: _boxes_of_things(picture.pixels)
         )
-        named = options.inpainter
-        inpainter = None if named is None else resolve("inpainter", trusted_spec(named), cancelled)
-        layers = separate_layers(
-            picture.pixels,
-            seen,
-            boxes,
-            names,
-            estimate.camera,
-            options,
-            depth=None if depth is None else 1.0 / depth.nearness,
-            inpainter=inpainter,
-            store=store,
-            steps=steps,
-        )
-        bodies = make_bodies(layers, estimate.camera, objects, options, store, steps, depth=depth)
-        layers, gloss = make_clean_plate(
-            layers,
-            picture.pixels,
-            [body.surface for body in bodies],
-            estimate.camera,
-            options,
-            inpainter=inpainter,
-            store=store,
-            steps=steps,
-        )
-        physics = decided_by_shapes(
-            physics,
-            [body.shape for body in bodies],
-            [body.size for body in bodies],
-            [is_furry(picture.pixels, mask) for mask in seen],
-        )
-        for name, decided in zip(names, physics, strict=True):
-            steps.notice(describe_decision(name, decided))
+        layers, bodies, gloss = run.layers_and_bodies(seen, boxes, estimate.camera, depth)
+        physics = run.decided_by_bodies(physics, bodies, seen)
         (folder / "light").mkdir()
         steps.begin("light")
-        radiance, light = _light(folder, picture, layers, estimate.camera, bodies, options, steps)
+        radiance, light = run.light(layers, estimate.camera, bodies)
+        write_environment(folder / ENVIRONMENT_FILE, radiance)
         looks = estimate_appearances(layers, estimate.camera, bodies, objects, physics, radiance, light, store, steps)
         steps.begin("write")
         found = SceneEstimate(
@@ -260,7 +124,7 @@ def reconstruct_photo(
             layers=layers,
             view=estimate.camera,
             bodies=bodies,
-            metres=_metres(bodies, physics, estimate, options, steps),
+            metres=run.metres_per_unit(bodies, physics, estimate),
             light=light,
             looks=looks,
             gloss=gloss,
@@ -272,22 +136,165 @@ def reconstruct_photo(
         save_scene(folder, scene)
         if options.report:
             steps.begin("report")
-            report = ReportData(
-                pixels=picture.pixels,
-                layers=layers,
-                shapes=[body.shape for body in bodies],
-                notices=steps.notices,
-                sources={
-                    "focal length": f"{estimate.focal_source}, ± {estimate.fov_sigma_deg:.0f}°",
-                    "ground": f"{estimate.normal_source}, ± {estimate.normal_sigma_deg:.0f}°",
-                },
-            )
-            write_report(folder / REPORT_FILE, Scene(folder, scene), report)
+            write_report(folder / REPORT_FILE, Scene(folder, scene), _report_data(found, estimate, steps))
         if settle is not None:
             scene = settle(Scene(folder, scene))
             save_scene(folder, scene)
         steps.finish()
     return Scene(root=out, model=scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """One reconstruction under way. picture: at working size. objects: with their names, in its pixels."""
+
+    picture: Photo
+    objects: Sequence[ObjectRequest]
+    options: ReconstructOptions
+    store: StageCache
+    steps: Steps
+
+    @property
+    def names(self) -> list[str]:
+        """Return the objects' names."""
+        return [item.name or "" for item in self.objects]
+
+    def answers(self, seen: Sequence[Mask], ask: ChatRequest | None, answered: str | None) -> Answers | None:
+        """Return the model's answers about the objects, or those in the text ``answered``; None where neither is.
+
+        seen: (H, W) visible pixels of each object. A model's answers are cached for equal masks.
+        """
+        names, pixels, steps = self.names, self.picture.pixels, self.steps
+        if ask is None:
+            return None if answered is None else read_answer(answered, len(names))
+        endpoint = {"address": str(ask.address), "model": ask.model}
+
+        def raw(notice: Notice) -> Arrays:
+            return {"raw": np.array(query_materials(pixels, seen, names, ask, notice, steps.cancelled).raw)}
+
+        try:
+            made = self.store.run("physics", {"pixels": pixels, "seen": seen, "names": names, **endpoint}, raw)
+        except InputError as error:
+            # An endpoint that is down must not lose an hour of corrections.
+            steps.notice(f"{error}; the objects are judged by their names")
+            return None
+        return read_answer(str(made["raw"]), len(names))
+
+    def depth(self) -> DepthMap | None:
+        """Return the user's or the depth estimator's depth map (H, W); None where neither is given."""
+        options, picture = self.options, self.picture
+        if options.depth is not None:
+            return read_depth(options.depth, picture.width, picture.height)
+        if options.depth_estimator is None:
+            return None
+        estimator = resolve("depth_estimator", trusted_spec(options.depth_estimator), self.steps.cancelled)
+        found = estimator(picture.pixels)
+        return DepthMap(
+            values=found.values,
+            disparity=found.meaning == "inverse",
+            metric=found.meaning == "metric",
+            focal=found.focal_px,
+        )
+
+    def layers_and_bodies(
+        self, seen: Sequence[Mask], boxes: Sequence[Box], view: Camera, depth: DepthMap | None
+    ) -> tuple[Layers, Sequence[Body], GroundGloss]:
+        """Return the photo's layers with the clean plate, the objects' bodies, and how the ground mirrors them.
+
+        seen: (H, W) visible pixels of each object, which lies in its box of ``boxes``. view: camera above z = 0.
+        """
+        named = self.options.inpainter
+        inpainter = None if named is None else resolve("inpainter", trusted_spec(named), self.steps.cancelled)
+        layers = separate_layers(
+            self.picture.pixels,
+            seen,
+            boxes,
+            self.names,
+            view,
+            self.options,
+            depth=None if depth is None else 1.0 / depth.nearness,
+            inpainter=inpainter,
+            store=self.store,
+            steps=self.steps,
+        )
+        bodies = make_bodies(layers, view, self.objects, self.options, self.store, self.steps, depth=depth)
+        layers, gloss = make_clean_plate(
+            layers,
+            self.picture.pixels,
+            [body.surface for body in bodies],
+            view,
+            self.options,
+            inpainter=inpainter,
+            store=self.store,
+            steps=self.steps,
+        )
+        return layers, bodies, gloss
+
+    def decided_by_bodies(
+        self, physics: Sequence[ObjectPhysics], bodies: Sequence[Body], seen: Sequence[Mask]
+    ) -> tuple[ObjectPhysics, ...]:
+        """Return ``physics`` of each object with what its body and its fur tell besides; the user is told of each."""
+        decided = decided_by_shapes(
+            physics,
+            [body.shape for body in bodies],
+            [body.size for body in bodies],
+            [is_furry(self.picture.pixels, mask) for mask in seen],
+        )
+        for name, item in zip(self.names, decided, strict=True):
+            self.steps.notice(describe_decision(name, item))
+        return decided
+
+    def metres_per_unit(
+        self, bodies: Sequence[Body], physics: Sequence[ObjectPhysics], estimate: CameraEstimate
+    ) -> float:
+        """Return metres per unit by the best source: the user, a model's answer, a metric depth map, usual sizes."""
+        extents, notice, usual = [body.extent for body in bodies], self.steps.notice, self.options.default_size_m
+        for source in ("chosen", "asked", "named"):
+            sizes = [item.size_m if item.size_source == source else None for item in physics]
+            if source == "named" and estimate.metres_per_unit is not None:
+                break
+            if any(size is not None for size in sizes):
+                if source == "named":
+                    notice(
+                        "no object has a size: the scale is guessed from the usual size of such objects; set a size_m"
+                    )
+                return metres_per_unit(extents, sizes, estimate, usual, notice)
+        return metres_per_unit(extents, [None] * len(bodies), estimate, usual, notice)
+
+    def light(self, layers: Layers, view: Camera, bodies: Sequence[Body]) -> tuple[Radiance, Light]:
+        """Return the light that reaches the scene: its environment map and the sun, with what the user gave."""
+        options = self.options
+        scene = LitScene(
+            camera=view,
+            ground=Ground(),
+            pixels=self.picture.pixels,
+            background=layers.background,
+            masks=layers.seen,
+            meshes=shadow_casters(view, layers.full, bodies),
+            things=layers.unboxed,
+        )
+        given = None
+        if options.environment is not None:
+            given = prepared_environment(options.environment, options.environment_frame, view, scene.ground)
+        return estimate_light(scene, given, self.steps.notice, with_sun=options.sun)
+
+
+def _working_photo(photo: Path, objects: Sequence[ObjectRequest], options: ReconstructOptions, steps: Steps) -> Photo:
+    """Return the photo at the size at which it is processed, once memory is known to suffice for its ``objects``."""
+    steps.begin("photo")
+    picture = load_photo(photo, options.max_size)
+    if picture.scale < 1.0:
+        steps.notice(
+            f"photo of {picture.original_size[0]}x{picture.original_size[1]} pixels is processed at "
+            f"{picture.width}x{picture.height}; max_size changes that"
+        )
+    require_memory(
+        reconstruction_bytes(_box_pixels(picture, objects), len(objects)),
+        available_memory(RECONSTRUCTION_RESERVED),
+        what=f"{len(objects)} objects in a photo of {picture.width}x{picture.height} pixels",
+        remedy="scale the photo down",
+    )
+    return picture
 
 
 def _box_pixels(picture: Photo, objects: Sequence[ObjectRequest]) -> int:
@@ -300,32 +307,8 @@ def _box_pixels(picture: Photo, objects: Sequence[ObjectRequest]) -> int:
 
 
 def _in_working_pixels(item: ObjectRequest, scale: float) -> ObjectRequest:
+    """Return ``item`` with its points in the photo times ``scale``."""
     return replace(item, mesh_points=tuple((place, (x * scale, y * scale)) for place, (x, y) in item.mesh_points))
-
-
-def _asked(
-    picture: Photo,
-    seen: Sequence[Mask],
-    names: Sequence[str],
-    request: ChatRequest | None,
-    store: StageCache,
-    steps: Steps,
-) -> Answers | None:
-    """The model's answers about the objects; the result is cached for equal masks."""
-    if request is None:
-        return None
-    endpoint = {"address": str(request.address), "model": request.model}
-
-    def raw(notice: Notice) -> Arrays:
-        return {"raw": np.array(query_materials(picture.pixels, seen, names, request, notice, steps.cancelled).raw)}
-
-    try:
-        made = store.run("physics", {"pixels": picture.pixels, "seen": seen, "names": names, **endpoint}, raw)
-    except InputError as error:
-        # An endpoint that is down must not lose an hour of corrections.
-        steps.notice(f"{error}; the objects are judged by their names")
-        return None
-    return read_answer(str(made["raw"]), len(names))
 
 
 def _boxes_of_things(pixels: NDArray[np.uint8]) -> list[tuple[float, float, float, float]]:
@@ -337,65 +320,20 @@ def _boxes_of_things(pixels: NDArray[np.uint8]) -> list[tuple[float, float, floa
     return [tuple(value / scale for value in item.box) for item in propose_boxes(small)]  # type: ignore[misc]
 
 
-def _depth(picture: Photo, options: ReconstructOptions, steps: Steps) -> DepthMap | None:
-    if options.depth is not None:
-        return read_depth(options.depth, picture.width, picture.height)
-    if options.depth_estimator is None:
-        return None
-    found = resolve("depth_estimator", trusted_spec(options.depth_estimator), steps.cancelled)(picture.pixels)
-    return DepthMap(
-        values=found.values,
-        disparity=found.meaning == "inverse",
-        metric=found.meaning == "metric",
-        focal=found.focal_px,
-    )
-
-
 def _friction(answers: Answers | None, options: ReconstructOptions) -> float:
+    """Return the ground's coefficient of friction: the user's, a model's, or the usual one."""
     return ground_friction(answers, Ground().friction) if options.friction is None else options.friction
 
 
-def _metres(
-    bodies: Sequence[Body],
-    physics: Sequence[ObjectPhysics],
-    estimate: CameraEstimate,
-    options: ReconstructOptions,
-    steps: Steps,
-) -> float:
-    """Metres per unit by the best source: the user, a model's answer, a metric depth map, usual sizes."""
-    extents, notice = [body.extent for body in bodies], steps.notice
-    for source in ("chosen", "asked", "named"):
-        sizes = [item.size_m if item.size_source == source else None for item in physics]
-        if source == "named" and estimate.metres_per_unit is not None:
-            break
-        if any(size is not None for size in sizes):
-            if source == "named":
-                notice("no object has a size: the scale is guessed from the usual size of such objects; set a size_m")
-            return metres_per_unit(extents, sizes, estimate, options.default_size_m, notice)
-    return metres_per_unit(extents, [None] * len(bodies), estimate, options.default_size_m, notice)
-
-
-def _light(
-    folder: Path,
-    picture: Photo,
-    layers: Layers,
-    view: Camera,
-    bodies: Sequence[Body],
-    options: ReconstructOptions,
-    steps: Steps,
-) -> tuple[Radiance, Light]:
-    scene = LitScene(
-        camera=view,
-        ground=Ground(),
-        pixels=picture.pixels,
-        background=layers.background,
-        masks=layers.seen,
-        meshes=shadow_casters(view, layers.full, bodies),
-        things=layers.unboxed,
+def _report_data(found: SceneEstimate, estimate: CameraEstimate, steps: Steps) -> ReportData:
+    """Return what the report shows besides the scene."""
+    return ReportData(
+        pixels=found.pixels,
+        layers=found.layers,
+        shapes=[body.shape for body in found.bodies],
+        notices=steps.notices,
+        sources={
+            "focal length": f"{estimate.focal_source}, ± {estimate.fov_sigma_deg:.0f}°",
+            "ground": f"{estimate.normal_source}, ± {estimate.normal_sigma_deg:.0f}°",
+        },
     )
-    given = None
-    if options.environment is not None:
-        given = prepared_environment(options.environment, options.environment_frame, view, scene.ground)
-    radiance, light = estimate_light(scene, given, steps.notice, with_sun=options.sun)
-    write_environment(folder / ENVIRONMENT_FILE, radiance)
-    return radiance, light
