@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .multiple_shooting import Fit, solve
 from .observed_poses import QUATERNION, SLOW_ERROR, TOGETHER, ObservedBody
-from .shooting_problem import Segment
+from .segmented_trial import Segment
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from .observed_poses import PUSHED, QUATERNION, RUBBED, TOUCHED
 from .rigid_simulator import RigidBody
-from .shooting_problem import Model, Problem
+from .segment_paths import Model
+from .shooting_problem import Problem
 
 Array = NDArray[np.float64]
 

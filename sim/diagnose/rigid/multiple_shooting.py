@@ -19,7 +19,9 @@ from scipy.special import gammaln
 
 from .observed_poses import perturbed
 from .rigid_candidates import BELIEFS
-from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, NormalEquations, Problem
+from .segment_paths import Model
+from .segmented_trial import Evaluation, NormalEquations
+from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Problem
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from .rigid_search import (
     followed,
     keep,
 )
-from .shooting_problem import Model
+from .segment_paths import Model
 
 BASES = 3
 """Single effects from which pairs start."""

@@ -14,7 +14,9 @@ from .multiple_shooting import Fit
 from .observed_poses import CONTACT, QUATERNION, SPIN, TOUCHED, VELOCITY, as_matrix, project
 from .rigid_candidates import BELIEFS, WorldSettings
 from .rigid_prediction import world_points
-from .shooting_problem import Model, Problem, Segment, SegmentedTrial
+from .segment_paths import Model
+from .segmented_trial import Segment, SegmentedTrial
+from .shooting_problem import Problem
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from .multiple_shooting import Fit
 from .observed_poses import QUATERNION, TOUCHED
 from .rigid_candidates import WorldSettings
-from .shooting_problem import Problem, Segment, SegmentedTrial
+from .segmented_trial import Segment, SegmentedTrial
+from .shooting_problem import Problem
 
 BEND_EVERY = 0.05
 """Time in s per polynomial degree of the smooth remainder."""

@@ -15,7 +15,9 @@ from .multiple_shooting import Fit, solve
 from .observed_poses import QUATERNION, SPIN, ObservedBody, another_side_up, as_matrix, fit_rotation, perturbed
 from .rigid_candidates import BELIEFS
 from .rigid_simulator import SLOTS
-from .shooting_problem import Model, Problem, SegmentedTrial
+from .segment_paths import Model
+from .segmented_trial import SegmentedTrial
+from .shooting_problem import Problem
 from .state_tracking import fit_states
 
 Array = NDArray[np.float64]

@@ -21,7 +21,9 @@ from .observed_poses import TOUCHED, ObservedBody, frame_pose, observe_body, tur
 from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, tether_numbers
 from .rigid_misfit import misfit
 from .rigid_simulator import RigidWorlds, on_its_rim, rigid_body
-from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Evaluation, Model, Problem
+from .segment_paths import Model
+from .segmented_trial import Evaluation
+from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Problem
 from .start_numbers import missing_forces, tether_start
 from .state_tracking import initial_camera, track_states
 

@@ -26,7 +26,9 @@ from .observed_poses import (
 from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidWorlds
-from .shooting_problem import Model, Problem, Segment, SegmentedTrial
+from .segment_paths import Model
+from .segmented_trial import Segment, SegmentedTrial
+from .shooting_problem import Problem
 
 Array = NDArray[np.float64]
 
