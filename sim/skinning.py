@@ -12,7 +12,7 @@ predictions are faded out by Tukey's biweight about the neighbours' median, so t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,10 @@ class Binding:
     offsets: Array
     spacing: Array
     rest: Array
+
+    def rows(self, rows: NDArray[np.integer] | slice) -> Binding:
+        """Return the binding of the vertices ``rows`` alone."""
+        return Binding(**{part.name: getattr(self, part.name)[rows] for part in fields(self)})
 
 
 def bind(vertices: NDArray[np.floating], particles: NDArray[np.floating], *, neighbours: int = 12) -> Binding:

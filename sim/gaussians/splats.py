@@ -134,11 +134,6 @@ class SplatBinding:
     def __len__(self) -> int:
         return len(self.skin.rest)
 
-    def part(self, rows: slice) -> Binding:
-        """Return the binding of the splats ``rows``."""
-        names = [field.name for field in dataclasses.fields(Binding)]
-        return Binding(**{name: getattr(self.skin, name)[rows] for name in names})
-
 
 def bind_splats(splats: Splats, particles: NDArray[np.floating]) -> SplatBinding:
     """Return the binding of ``splats`` to ``particles`` (P, 3), both at rest in world metres.
@@ -163,7 +158,7 @@ def deformed_half_axes(
     centres, axes = np.empty((len(splats), 3)), half_axes(splats)
     for start in range(0, len(splats), CHUNK):
         rows = slice(start, start + CHUNK)
-        centres[rows], f = deform_locally(binding.part(rows), positions, gradients)
+        centres[rows], f = deform_locally(binding.skin.rows(rows), positions, gradients)
         axes[rows] = _limited(f) @ axes[rows]
     return centres, axes
 
