@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
-from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.gaussians.views.posed_images import View, orbit_camera
 from physgen.sim.gaussians.views.view_files import save_views
 from physgen.sim.scene.folder import save_scene

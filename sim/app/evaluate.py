@@ -26,7 +26,8 @@ from ..evaluate.bake_physics import bake_physics
 from ..evaluate.evaluation import HIGHER, JSON_FILE, NEITHER, Evaluation, Measure, Section, table, write_evaluation
 from ..evaluate.flow import dis_flow, network_flow
 from ..evaluate.footage import MOST_FRAMES, Footage, Frame, open_footage
-from ..evaluate.model_judge import CRITERIA, TITLES, Judgement, JudgeOptions, evenly_sampled, judge_videos
+from ..evaluate.judge_question import CRITERIA, TITLES
+from ..evaluate.model_judge import Judgement, JudgeOptions, evenly_sampled, judge_videos
 from ..evaluate.no_reference import without_reference
 from ..evaluate.physics_iq import against as against_section
 from ..evaluate.physics_iq_folder import (

@@ -9,7 +9,6 @@ reported, and an answer that does not keep to scale and form is asked for again 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,34 +22,9 @@ from ..events import IsCancelled, never
 from ..reconstruct.reasoning.chat_client import ChatRequest, Wording, complete_content
 from ..reconstruct.reasoning.material_query import jpeg_bytes
 from ..validation import quantity, require_quantities
-
-CRITERIA = ("physical_realism", "photorealism", "semantic_consistency")
-"""Criteria, the same for the model as for people."""
-
-TITLES = {name: name.replace("_", " ").capitalize() for name in CRITERIA}
-MOST_VIDEOS = 8
-MAX_TEXT = 2**16
-"""Characters of an answer that are read; a good one has about a hundred for each video."""
-
-MAX_PROMPT = 1000
+from .judge_question import CRITERIA, MAX_PROMPT, MAX_TEXT, MOST_VIDEOS, ReadAnswer, question, read_scores
 
 _WORDING = Wording(sent="frames", lost="the videos were not judged")
-_QUESTION = """\
-You are asked to judge {count} generated from the same photo and the same text. You see the photo first, then {frames} \
-evenly spaced frames of each video, in order of time. The text says what should happen: '{prompt}'
-
-Judge each video by three criteria:
-- Physical realism: does the motion follow the laws of physics, and do things show real properties such as \
-weight, elasticity and friction? A video in which nothing moves must lose points here, even though stillness is real.
-- Photorealism: the visual quality. Are there artefacts or jumps, and how well are light, shadow, texture and \
-material of the photo kept?
-- Semantic consistency: how well does what happens agree with the text?
-
-Give a score from 0 to 1 for each criterion, 1 being the best. Write one line for each video, exactly in this form, \
-with a ';' after each score, and nothing else:
-{lines}
-"""
-_LINE = "Video {}: Physical Realism Score: [score]; Photorealism Score: [score]; Semantic Consistency Score: [score];"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,98 +124,6 @@ def evenly_sampled(count: int, wanted: int) -> NDArray[np.int64]:
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, wanted))).astype(np.int64))
 
 
-def question(count: int, frames: int, prompt: str) -> str:
-    """Return the question about ``count`` videos of which ``frames`` frames each are shown."""
-    lines = "\n".join(_LINE.format(number) for number in range(1, count + 1))
-    what = "one video" if count == 1 else f"{count} videos"
-    plain = " ".join("".join(c if c.isprintable() else " " for c in prompt).split()).replace("'", "’")
-    return _QUESTION.format(count=what, frames=frames, prompt=plain[:MAX_PROMPT], lines=lines)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadAnswer:
-    """An answer as far as it can be read.
-
-    scores: for each video in the order shown, its criteria; None unless all three are there and within 0 to 1.
-    problems: what is wrong, one sentence each.
-    """
-
-    scores: tuple[Mapping[str, float] | None, ...]
-    problems: tuple[str, ...]
-
-
-_VIDEO = re.compile(r"\bvideo\W{0,4}(\d{1,3})\b", re.IGNORECASE)
-_NUMBER = re.compile(
-    r"\s*(?:score)?[\s:=\[(\"'*_`]*([+-]?(?:\d{1,9}(?:[.,]\d{1,9})?|[.,]\d{1,9}))"
-    r"(\s*(?:%|/\s*\d{1,6}|out\s+of\s+\d{1,6}|(?:-|–|to)\s*[\d.,]{1,9}))?",
-    re.IGNORECASE,
-)
-_CRITERIA = {name: re.compile(name.replace("_", r"[\s_-]*"), re.IGNORECASE) for name in CRITERIA}
-
-
-def read_scores(text: str, count: int) -> ReadAnswer:
-    """Parse an answer about ``count`` videos. Never raises.
-
-    Markdown, brackets, JSON's quotes and other line breaks than asked for are understood. Nothing is clamped or scaled:
-    a number outside of 0 to 1, a percentage, or 8/10 is a problem, and its video has no score.
-    """
-    problems: list[str] = []
-    if len(text) > MAX_TEXT:
-        problems.append(f"the answer has {len(text)} characters; only the first {MAX_TEXT} are read")
-    # Reasoning models draft answers before the final one.
-    text = text[: 2 * MAX_TEXT].rpartition("</think>")[2][:MAX_TEXT]
-    # "Photorealism" holds no other criterion's name, but "physical realism" may be written as one word.
-    marks = list(_VIDEO.finditer(text))
-    found: list[dict[str, float] | None] = [None] * count
-    seen: set[int] = set()
-    for index, mark in enumerate(marks):
-        number = int(mark[1])
-        part = text[mark.end() : marks[index + 1].start() if index + 1 < len(marks) else len(text)]
-        if not any(pattern.search(part) for pattern in _CRITERIA.values()):
-            continue
-        if not 1 <= number <= count:
-            problems.append(f"video {number}: there {'is' if count == 1 else 'are'} {count}; left out")
-            continue
-        scores, wrong = _criteria(part)
-        if number in seen:
-            # The model contradicts itself, or the answer has a draft: neither can be trusted.
-            problems.append(f"video {number}: answered more than once; left out")
-            found[number - 1] = None
-            continue
-        seen.add(number)
-        problems += [f"video {number}: {sentence}" for sentence in wrong]
-        found[number - 1] = scores if not wrong else None
-    missing = [number for number in range(1, count + 1) if number not in seen]
-    if len(missing) == count:
-        problems.append(f"no line of scores in the answer, which begins {_quoted(text)}")
-    else:
-        problems += [f"video {number}: no line in the answer" for number in missing]
-    return ReadAnswer(scores=tuple(found), problems=tuple(problems[:40]))
-
-
-def _criteria(part: str) -> tuple[dict[str, float], list[str]]:
-    scores: dict[str, float] = {}
-    wrong: list[str] = []
-    for name, pattern in _CRITERIA.items():
-        label = name.replace("_", " ")
-        mark = pattern.search(part)
-        number = None if mark is None else _NUMBER.match(part, mark.end())
-        if mark is None or number is None:
-            wrong.append(f"no {label}" if mark is None else f"{label} without a number")
-            continue
-        value, unit = float(number[1].replace(",", ".")), " ".join((number[2] or "").split())
-        if unit.replace(" ", "") not in ("", "/1", "outof1") or not 0.0 <= value <= 1.0:
-            wrong.append(f"{label} is {f'{number[1]} {unit}'.strip()!r}, not a number on the scale of 0 to 1")
-        else:
-            scores[name] = value
-    return scores, wrong
-
-
-def _quoted(text: str) -> str:
-    plain = " ".join("".join(c if c.isprintable() else " " for c in text[:400]).split())
-    return repr(plain if len(plain) <= 120 else plain[:119] + "…")
-
-
 def judge_videos(
     videos: Mapping[str, Sequence[NDArray[np.uint8]]],
     photo: NDArray[np.uint8],
@@ -268,24 +150,16 @@ def judge_videos(
         raise InputError(
             f"prompt has {len(prompt)} characters; say in 1 to {MAX_PROMPT} what should happen in the videos"
         )
-    pictures = {name: _sampled(name, frames, options) for name, frames in videos.items()}
-    shown = {name: len(frames) for name, frames in pictures.items()}
-    notes: list[str] = []
-
-    def note(sentence: str) -> None:
-        notes.append(sentence)
-        notice(sentence)
-
-    for name, count in shown.items():
-        if count < options.frames:
-            note(f"{name}: has {count} frames, all of which are shown; {options.frames} are usual")
-    photo_jpeg = jpeg_bytes(_scaled(photo, options.longest_side))
-    sent = len(photo_jpeg) + sum(len(jpeg) for frames in pictures.values() for jpeg in frames)
-    questions = f"{options.repetitions} question{'s' * (options.repetitions != 1)}"
-    notice(
-        f"frames go to {request.address} (model {request.model}): {questions}, each with the photo and "
-        f"{sum(shown.values())} frames of {len(videos)} video{'s' * (len(videos) != 1)}, {sent >> 10} KiB"
+    questions = _Questions(
+        photo=jpeg_bytes(_scaled(photo, options.longest_side)),
+        pictures={name: _sampled(name, frames, options) for name, frames in videos.items()},
+        prompt=prompt,
+        request=request,
+        options=options,
+        notice=notice,
+        cancelled=cancelled,
     )
+    questions.announce()
     random = np.random.default_rng(options.seed)
     names = list(videos)
     values: dict[str, dict[str, list[float]]] = {name: {c: [] for c in CRITERIA} for name in names}
@@ -293,44 +167,21 @@ def judge_videos(
     answers: list[tuple[str, ...]] = []
     for repetition in range(1, options.repetitions + 1):
         order = tuple(names[i] for i in random.permutation(len(names)))
+        asked = questions.ask(repetition, order, needed=not answers)
         orders.append(order)
-        content: list[str | bytes] = [question(len(order), options.frames, prompt), "The photo:", photo_jpeg]
-        for number, name in enumerate(order, start=1):
-            content += [f"{shown[name]} evenly spaced frames of video {number}:", *pictures[name]]
-        best: ReadAnswer | None = None
-        raw: list[str] = []
-        silent = False
-        for attempt in range(1, options.attempts + 1):
-            try:
-                text = complete_content(
-                    request, content, notice, cancelled, temperature=options.temperature, wording=_WORDING
-                )
-            except InputError as error:
-                # What was answered before is not lost, and may have been paid for.
-                if not (answers or raw):
-                    raise
-                note(f"answer {repetition}{f', attempt {attempt}' if attempt > 1 else ''}: {error}")
-                silent = True
-                break
-            raw.append(text[:MAX_TEXT])
-            read = read_scores(text, len(order))
-            for problem in read.problems:
-                note(f"answer {repetition}{f', attempt {attempt}' if attempt > 1 else ''}: {problem}")
-            if best is None or _readable(read) > _readable(best):
-                best = read
-            if _readable(best) == len(order):
-                break
-        answers.append(tuple(raw))
-        for name, scores in zip(order, best.scores if best else (None,) * len(order), strict=True):
+        answers.append(asked.texts)
+        for name, scores in zip(order, asked.scores, strict=True):
             if scores is None:
-                note(f"repetition {repetition}: no score for {name}, which has one value less")
+                questions.note(f"repetition {repetition}: no score for {name}, which has one value less")
                 continue
             for criterion, value in scores.items():
                 values[name][criterion].append(value)
-        if silent:
+        if asked.silent:
             left = options.repetitions - repetition
             if left:
-                note(f"{left} of {options.repetitions} repetitions were not asked: the endpoint does not answer")
+                questions.note(
+                    f"{left} of {options.repetitions} repetitions were not asked: the endpoint does not answer"
+                )
             break
     return Judgement(
         model=request.model,
@@ -340,12 +191,91 @@ def judge_videos(
         scores={name: {c: Score(values=tuple(v)) for c, v in of.items()} for name, of in values.items()},
         orders=tuple(orders),
         answers=tuple(answers),
-        notes=tuple(notes),
+        notes=tuple(questions.notes),
     )
 
 
-def _readable(read: ReadAnswer) -> int:
-    return sum(scores is not None for scores in read.scores)
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What came of one repetition. texts: all answers; scores: of the videos in the order shown, of the answer that
+    could be read best; silent: whether the endpoint stopped answering."""
+
+    texts: tuple[str, ...]
+    scores: tuple[Mapping[str, float] | None, ...]
+    silent: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Questions:
+    """Questions about the same videos in different orders. photo: JPEG; pictures: by video, JPEGs of its frames. notes:
+    what was wrong so far."""
+
+    photo: bytes
+    pictures: Mapping[str, Sequence[bytes]]
+    prompt: str
+    request: ChatRequest
+    options: JudgeOptions
+    notice: Callable[[str], None]
+    cancelled: IsCancelled
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, sentence: str) -> None:
+        """Keep ``sentence`` and tell it."""
+        self.notes.append(sentence)
+        self.notice(sentence)
+
+    def announce(self) -> None:
+        """Tell which videos are short, and what goes where."""
+        counts = {name: len(frames) for name, frames in self.pictures.items()}
+        for name, count in counts.items():
+            if count < self.options.frames:
+                self.note(f"{name}: has {count} frames, all of which are shown; {self.options.frames} are usual")
+        sent = len(self.photo) + sum(len(jpeg) for frames in self.pictures.values() for jpeg in frames)
+        repetitions = self.options.repetitions
+        self.notice(
+            f"frames go to {self.request.address} (model {self.request.model}): {repetitions} "
+            f"question{'s' * (repetitions != 1)}, each with the photo and {sum(counts.values())} frames of "
+            f"{len(counts)} video{'s' * (len(counts) != 1)}, {sent >> 10} KiB"
+        )
+
+    def ask(self, repetition: int, order: tuple[str, ...], *, needed: bool) -> _Asked:
+        """Return the answer about the videos in this ``order``, asked again while it cannot be read whole.
+
+        needed: InputError where nothing arrives at all; otherwise that is a note.
+        """
+        content: list[str | bytes] = [question(len(order), self.options.frames, self.prompt), "The photo:", self.photo]
+        for number, name in enumerate(order, start=1):
+            content += [f"{len(self.pictures[name])} evenly spaced frames of video {number}:", *self.pictures[name]]
+        best = ReadAnswer(scores=(None,) * len(order), problems=())
+        texts: list[str] = []
+        silent = False
+        for attempt in range(1, self.options.attempts + 1):
+            which = f"answer {repetition}{f', attempt {attempt}' if attempt > 1 else ''}"
+            try:
+                text = complete_content(
+                    self.request,
+                    content,
+                    self.notice,
+                    self.cancelled,
+                    temperature=self.options.temperature,
+                    wording=_WORDING,
+                )
+            except InputError as error:
+                # What was answered before is not lost, and may have been paid for.
+                if needed and not texts:
+                    raise
+                self.note(f"{which}: {error}")
+                silent = True
+                break
+            texts.append(text[:MAX_TEXT])
+            read = read_scores(text, len(order))
+            for problem in read.problems:
+                self.note(f"{which}: {problem}")
+            if read.readable > best.readable:
+                best = read
+            if best.readable == len(order):
+                break
+        return _Asked(texts=tuple(texts), scores=best.scores, silent=silent)
 
 
 def _sampled(name: str, frames: Sequence[NDArray[np.uint8]], options: JudgeOptions) -> list[bytes]:

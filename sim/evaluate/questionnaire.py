@@ -30,7 +30,7 @@ from ..files import is_file, open_file, read_toml, shown
 from ..html import FONT, PALETTES, Markup, page_head, render
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
-from .model_judge import CRITERIA, MAX_PROMPT, MOST_VIDEOS, TITLES
+from .judge_question import CRITERIA, MAX_PROMPT, MOST_VIDEOS, TITLES
 
 CASE_FILE, KEY_FILE, PAGES = "case.toml", "key.json", "pages"
 FORMAT, ANSWERS_FORMAT = "physgen questionnaire", "physgen questionnaire answers"

@@ -23,7 +23,7 @@ from ..files import shown, without_folder
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .evaluation import no_formula
-from .model_judge import CRITERIA, TITLES
+from .judge_question import CRITERIA, TITLES
 from .questionnaire import ANSWERS_FORMAT, load_key
 from .questionnaire_report import PAGE_FILE, result_page
 

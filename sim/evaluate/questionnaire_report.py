@@ -9,7 +9,7 @@ from typing import Any
 
 from ..diagnose.report.diagnosis_charts import Scale
 from ..html import Markup, Picture, element, join, label, page_head, page_style, render, shortened
-from .model_judge import CRITERIA, TITLES
+from .judge_question import CRITERIA, TITLES
 
 PAGE_FILE = "report.html"
 WIDTH, LEFT, ROW, TOP, BOTTOM = 320.0, 124.0, 26.0, 8.0, 24.0

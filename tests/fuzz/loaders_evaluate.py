@@ -14,7 +14,7 @@ from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.errors import InputError
 from physgen.sim.evaluate.bake_physics import bake_physics
 from physgen.sim.evaluate.footage import open_footage
-from physgen.sim.evaluate.model_judge import CRITERIA, read_scores
+from physgen.sim.evaluate.judge_question import CRITERIA, read_scores
 from physgen.sim.evaluate.physics_iq import against
 from physgen.sim.evaluate.physics_iq_folder import read_benchmark, read_submission
 from physgen.sim.evaluate.questionnaire import FORMAT, load_case, load_key

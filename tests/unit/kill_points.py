@@ -46,7 +46,7 @@ from physgen.sim.cache.folder_lock import LOCK_FILE, remove_dead_lock
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.diagnose import run_diagnosis
 from physgen.sim.diagnose.capture import load_capture
-from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.folder import load_scene

@@ -14,14 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from physgen.batch.cli import main
 from physgen.sim.errors import InputError
-from physgen.sim.evaluate.model_judge import (
-    CRITERIA,
-    JudgeOptions,
-    evenly_sampled,
-    judge_videos,
-    question,
-    read_scores,
-)
+from physgen.sim.evaluate.judge_question import CRITERIA, question, read_scores
+from physgen.sim.evaluate.model_judge import JudgeOptions, evenly_sampled, judge_videos
 from physgen.sim.reconstruct.reasoning.chat_client import ChatRequest
 from PIL import Image
 

@@ -10,7 +10,7 @@ from physgen.batch.farm.planning.plan import Outcome
 from physgen.sim.diagnose.diagnosis import Estimate, Provenance, RankedEffect
 from physgen.sim.diagnose.report import write_report
 from physgen.sim.evaluate.evaluation import HIGHER, LOWER, Curve, Evaluation, Measure, Section
-from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.evaluate.questionnaire_report import result_page
 from physgen.sim.evaluate.report import page
 from physgen.sim.html import page_head, page_style, prose, render

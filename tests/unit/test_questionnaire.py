@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
 from physgen.sim.errors import InputError
-from physgen.sim.evaluate.model_judge import CRITERIA
+from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.evaluate.questionnaire import load_case, load_key, make_questionnaire
 from physgen.sim.evaluate.questionnaire_answers import (
     CollectOptions,
