@@ -117,15 +117,7 @@ def import_capture(
     out = Path(out)
     if out.exists():
         raise InputError(f"{out}: already exists; choose another folder")
-    tables = [t for file in files for t in read_recording(Path(file), request.columns, request.points)]
-    if not tables:
-        raise InputError("no file was given")
-    if len({t.labels for t in tables}) > 1:
-        raise InputError("the takes have different points: track the same points in each")
-    names = [t.name for t in tables]
-    tables = [
-        dataclasses.replace(t, name=f"{t.name}_{i}") if names.count(t.name) > 1 else t for i, t in enumerate(tables)
-    ]
+    tables = _takes(files, request)
 
     def say(message: str) -> None:
         on_event({"event": "notice", "stage": "import", "message": message})
@@ -143,30 +135,12 @@ def import_capture(
     points = _lengths(tables, request, settle)
     points, turns = _upright(tables, points, times, request, settle)
     rest = _rest(tables[0], item, request)
-    trials = []
-    for table, clock, seen, turn in zip(tables, times, points, turns, strict=True):
-        observed = seen if turn is None else seen + np.einsum("tij,kj->tki", turn, rest)
-        trials.append(
-            Trial(
-                name=table.name,
-                role="fit",
-                times=clock,
-                points=observed,
-                pixels=None,
-                object_index=np.zeros(len(rest), dtype=np.int64),
-                rest_points=rest,
-            )
-        )
+    trials = [_trial(*take, rest) for take in zip(tables, times, points, turns, strict=True)]
     noise = request.noise
     if noise is None:
         noise = _noise(trials)
         say(f"noise: {1e3 * noise:.3g} mm per coordinate, from how the points jump from frame to frame")
-    low = min(float(np.nanmin(t.observed[..., 2])) for t in trials)
-    size = float(np.ptp(item.vertices, axis=0).max())
-    if low < request.ground - size:
-        raise InputError(
-            f"a point is at a height of {low:.3g} m, below the ground at {request.ground:g} m: give ground"
-        )
+    _check_heights(trials, item, request)
     if len(trials) == 1:
         say("a lone take: a cause is judged by its second half only; three takes that differ tell far more")
     if request.hold_out and len(trials) > 1:
@@ -181,6 +155,46 @@ def import_capture(
     )
     save_capture(capture, out)
     return load_capture(out)
+
+
+def _takes(files: Sequence[str | Path], request: ImportRequest) -> list[RecordedTable]:
+    """Return the takes in ``files``, which track the same points, with a name of its own each."""
+    tables = [t for file in files for t in read_recording(Path(file), request.columns, request.points)]
+    if not tables:
+        raise InputError("no file was given")
+    if len({t.labels for t in tables}) > 1:
+        raise InputError("the takes have different points: track the same points in each")
+    names = [t.name for t in tables]
+    return [
+        dataclasses.replace(t, name=f"{t.name}_{i}") if names.count(t.name) > 1 else t for i, t in enumerate(tables)
+    ]
+
+
+def _trial(table: RecordedTable, times: Array, points: Array, turns: Array | None, rest: Array) -> Trial:
+    """Return the take ``table`` as a trial.
+
+    times: (T,) s. points: (T, K, 3) m, tracked ones, or the body's origin where its ``turns`` (T, 3, 3) are known.
+    rest: (K, 3) m in its rest frame.
+    """
+    return Trial(
+        name=table.name,
+        role="fit",
+        times=times,
+        points=points if turns is None else points + np.einsum("tij,kj->tki", turns, rest),
+        pixels=None,
+        object_index=np.zeros(len(rest), dtype=np.int64),
+        rest_points=rest,
+    )
+
+
+def _check_heights(trials: Sequence[Trial], item: CaptureObject, request: ImportRequest) -> None:
+    """Raise InputError where a point is farther below the ground than the body is large."""
+    low = min(float(np.nanmin(t.observed[..., 2])) for t in trials)
+    size = float(np.ptp(item.vertices, axis=0).max())
+    if low < request.ground - size:
+        raise InputError(
+            f"a point is at a height of {low:.3g} m, below the ground at {request.ground:g} m: give ground"
+        )
 
 
 def _body(request: ImportRequest) -> CaptureObject:
