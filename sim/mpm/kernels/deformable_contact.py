@@ -16,7 +16,7 @@ all directions. With the normal n from the gradients of both shares, gap = d_a +
 
     j >= 0,   v_n + gap / dt >= 0,   one of the two an equality;     |t| <= mu j (Coulomb)
 
-or, for the share e of it (the pair's restitution), j from a spring on the overlap, as in ``particle_contact``.
+or, for the share e of it (the pair's restitution), j from a spring on the overlap, as in ``contact_law``.
 They are equal and opposite and act at one point: momentum and angular momentum are exact. Edges and corners fill
 less of their surroundings than faces do and count as rounded, by about a third of a cell.
 
@@ -35,6 +35,7 @@ import taichi as ti
 from .adhesion import counted, largest_pull, least_speed
 from .body_faces import facing, facing_thin, find_faces, meet_as_thin, surer
 from .constitutive_response import LOG_VOLUMES, is_fluid, is_one_of, law_of
+from .contact_law import HOLD, SPRING, coulomb, parting_speed
 from .interpolation import weights
 from .kernel_arrays import (
     AdhesionArrays,
@@ -77,7 +78,6 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_contact import HOLD, SPRING, coulomb, parting_speed
 from .windows import add_to, clear_window, first_of, gathered, in_cells, layer, store_window, sum_chosen_windows
 
 SWEEPS = 8

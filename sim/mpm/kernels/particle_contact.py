@@ -7,14 +7,7 @@
 Zeroing the velocity of nodes below a surface stops a body up to a cell too early, because a particle feels nodes 1.5
 cells away. Here the unknowns are one contact impulse m_p a_p per particle near a surface, spread to the nodes with the
 particle's own weights (so momentum is exact), and the conditions hold at the particles, whose distance to the surface
-is known far below a cell:
-
-    phi_p = distance(x_p) - r_p              r_p: contact radius, the particle's distance to its body's surface
-    a_n >= 0,   v_n + phi_p / dt >= 0,   one of the two an equality         (no attraction, no penetration)
-    |a_t| <= mu_s a_n,   v_t = 0 inside the cone, mu_k a_n beyond it        (Coulomb; v against the surface's velocity)
-
-Where the pair's restitution e is above 0, the share e of a_n comes from a spring on the depth instead, which gives back
-the energy of the layer that the inelastic condition stops.
+is known far below a cell; ``contact_law`` has them.
 
 Of the surfaces around a particle the nearest is treated so; the next one only pushes, anew in each substep. A pin is
 a surface that holds the particle from all sides.
@@ -27,7 +20,7 @@ the particle), which makes it exact for even contact and stable for any, by Gers
 import taichi as ti
 
 from ..rigid.rigid_layout import STATE, X
-from .adhesion import MOST_REACH, largest_pull, least_speed
+from .adhesion import MOST_REACH, largest_pull
 from .collider_distance import (
     PUSH,
     REACH_FACTOR,
@@ -38,6 +31,7 @@ from .collider_distance import (
     single3,
     surface_slide,
 )
+from .contact_law import RECOVERY, parting_speed, press
 from .interpolation import weights
 from .kernel_arrays import (
     AdhesionArrays,
@@ -65,21 +59,15 @@ from .layout import (
     FULL,
     HAS_ANCHORS,
     HAS_PLANE,
-    MODE,
     PHASE,
     PLANE_NORMAL,
     PLANE_OFFSET,
     RECOVERY_SPEED,
-    RESTITUTION,
     RIGID_BODIES,
     RIGID_SPEED,
-    SEPARATE,
-    SLIDING,
-    SLIP,
     SPEED,
     SPREAD,
     STEP,
-    STICKING,
     TOUCH_ROW,
     WINDOW_NODES,
     WORLD,
@@ -105,15 +93,8 @@ from .windows import (
     turns,
 )
 
-RECOVERY = 0.2
-"""Share of a particle's penetration that one substep may correct."""
-
 LEAST_REACH = 0.02
 """Cells from a surface within which a particle at rest takes part in the contact."""
-
-SPRING = 0.15
-"""Share of a particle's depth, in velocity times substep, that an elastic contact gives back each substep: the spring
-of a layer one cell thick where waves travel 0.39 cells a substep, hence as stable as the body itself."""
 
 MOST_SLACK = 0.5
 """Cells of travel at most before a block's particles are tested again."""
@@ -121,64 +102,6 @@ MOST_SLACK = 0.5
 AHEAD = 3.0
 """Reaches from a rigid body within which a particle's mass counts as touching it: known one substep ahead, so that the
 first impact on a light body is not solved as if nothing else touched it."""
-
-HOLD = 0.1
-"""Cells within which surfaces that must not part count as touching."""
-
-
-@ti.func
-def parting_speed(gap: ti.f32, dt: ti.f32, recovery: ti.f32):
-    """Least separating speed (cells/s) of surfaces ``gap`` cells apart: they may touch; depth is reduced gently."""
-    speed = -gap / dt
-    if gap < 0.0:
-        speed = ti.min(RECOVERY * speed, recovery)
-    return speed
-
-
-@ti.func
-def coulomb(wanted: vec3, normal_size: ti.f32, sticking: ti.f32, sliding: ti.f32):
-    """Return the tangential impulse ``wanted`` to stop sliding, limited by friction on ``normal_size``."""
-    size = wanted.norm()
-    result = wanted
-    if size > sticking * normal_size:
-        result = wanted * (sliding * normal_size / size)
-    return result
-
-
-@func
-def press(
-    adheres: ti.template(),
-    old: vec3,
-    velocity: vec3,
-    phi: ti.f32,
-    normal: vec3,
-    share: ti.f32,
-    dt: ti.f32,
-    recovery: ti.f32,
-    touch: ti.i32,
-    pull: ti.f32,
-    worlds: WorldArrays,
-):
-    """New impulse over mass (cells/s) of a particle that moves at ``velocity`` against a surface ``phi`` cells away,
-    which pulls with at most ``pull`` (cells/s) where it ``adheres``."""
-    v_n = velocity.dot(normal)
-    wanted = parting_speed(phi, dt, recovery)
-    old_n = old.dot(normal)
-    elastic = worlds.contacts[touch + RESTITUTION]
-    new_n = (1.0 - elastic) * (old_n + (wanted - v_n) / share) + elastic * (SPRING * ti.max(0.0, -phi) / (dt * share))
-    new_t = old - old_n * normal - (velocity - v_n * normal) / share
-    mode = ti.cast(worlds.contacts[touch + MODE], ti.i32)
-    if mode == SEPARATE or phi > HOLD:
-        pressing = ti.max(0.0, new_n)
-        new_n = pressing
-        if ti.static(adheres):
-            if pressing == 0.0:
-                new_n = ti.max(-pull, ti.min(0.0, old_n + (least_speed(phi, wanted, dt) - v_n) / share))
-            pressing = new_n + pull
-        new_t = coulomb(new_t, pressing, worlds.contacts[touch + STICKING], worlds.contacts[touch + SLIDING])
-    elif mode == SLIP:
-        new_t *= 0.0
-    return new_n * normal + new_t
 
 
 @func

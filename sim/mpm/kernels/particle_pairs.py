@@ -23,6 +23,7 @@ Only particles that lie DEEP in the share of other bodies look for partners: at 
 import taichi as ti
 
 from .body_faces import left_by_others
+from .contact_law import parting_speed
 from .interpolation import weights
 from .kernel_arrays import (
     BlockTable,
@@ -55,7 +56,6 @@ from .layout import (
     vec3,
     vec4,
 )
-from .particle_contact import parting_speed
 from .sorting import block_key, slot_of
 from .windows import grid_node, in_cells
 
