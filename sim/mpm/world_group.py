@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -16,6 +17,7 @@ from ..events import IsCancelled, never
 from ..memory import return_freed_memory
 from ..scene.units import ENGINE_BOX_SIZE, Similarity
 from . import packing
+from .active_bodies import ActiveBodies
 from .colliders import SAME_TIME
 from .diagnostics import FittedGradients
 from .engine import MOST_RETRIES, Diverged, Engine, Stopped, upload_new
@@ -25,7 +27,6 @@ from .kernels.time_stepping import RIGID_LOST
 from .particle_store import State
 from .quiet_matter import new_quiet_matter
 from .rigid.rigid_bodies import RigidBodies, RigidPose
-from .sleeping import Sleepers
 from .solver_options import SolverOptions
 from .timed_events import (
     BodyRows,
@@ -49,9 +50,6 @@ RIGID_PREFIX = "solids."
 
 ROUNDING = 1e-12
 """Rounding error of sums of times, s."""
-
-LEAST_WATCH = 1e-4
-"""Seconds that pass at least between two looks at what may touch a sleeper."""
 
 
 class WorldGroup:
@@ -79,18 +77,7 @@ class WorldGroup:
             check_start(setup, self.cells)
         self.arch, self._generation = runtime.ensure_started(self.options)
         self._places = packing.world_slots(self.setups, [self.cells] * len(self.setups))
-        counts = [body.count for setup in self.setups for body in setup.bodies]
-        self._first_body = np.concatenate([[0], np.cumsum([len(setup.bodies) for setup in self.setups])])
-        self._offsets = np.concatenate([[0], np.cumsum(counts)])
-        self._started = np.zeros(len(counts), dtype=bool)
-        cell = 1.0 / self.cells.scale
-        self._sleepers = [
-            Sleepers(setup, cell) if any(body.asleep for body in setup.bodies) else None for setup in self.setups
-        ]
-        self._asleep = np.zeros(len(counts), dtype=bool)
-        for world, sleepers in enumerate(self._sleepers):
-            if sleepers is not None:
-                self._asleep[self._first_body[world] : self._first_body[world + 1]] = sleepers.asleep
+        self._bodies = ActiveBodies(self.setups, 1.0 / self.cells.scale)
         self._times = np.zeros(len(self.setups))
         self._between = False
         self._rigid_bodies = self._new_rigid_bodies()
@@ -100,7 +87,9 @@ class WorldGroup:
         self._fits: dict[int, FittedGradients] = {}
         self._followed: dict[int, DeformableMaterial] = {}
         self._shares: dict[int, ti.Ndarray] = {}
-        self._quiet_matter = new_quiet_matter(self._places, self._offsets, self.arch) if self.options.implicit else None
+        self._quiet_matter = (
+            new_quiet_matter(self._places, self._bodies.offsets, self.arch) if self.options.implicit else None
+        )
         self._reach_times(np.full(len(self), -math.inf))
 
     def _new_rigid_bodies(self) -> RigidBodies:
@@ -108,15 +97,15 @@ class WorldGroup:
         place = (float(origin[0]), float(origin[1]), float(origin[2]))
         rigid_bodies = RigidBodies(self.setups, [self.cells.scale] * len(self), [place] * len(self))
         for world, setup in enumerate(self.setups):
-            first = int(self._first_body[world])
-            rigid = [i for i, body in enumerate(setup.bodies) if body.rigid and self._asleep[first + i]]
+            asleep = self._bodies.asleep[self._bodies.of(world)]
+            rigid = [i for i, body in enumerate(setup.bodies) if body.rigid and asleep[i]]
             rigid_bodies.asleep |= {(world, setup.bodies[i].name) for i in rigid}
         return rigid_bodies
 
     def _new_engine(self) -> Engine:
         soft = [not body.rigid for setup in self.setups for body in setup.bodies]
         return Engine(
-            capacity=int(np.diff(self._offsets)[soft].sum()),
+            capacity=int(np.diff(self._bodies.offsets)[soft].sum()),
             cfl_elastic=self.options.cfl_elastic,
             cfl_velocity=self.options.cfl_velocity,
             numbers=packing.pack(self._places),
@@ -218,10 +207,10 @@ class WorldGroup:
         middle = 0.5 * (self._times + stops)
         changed = False
         for place in self._places:
-            first = int(self._first_body[place.world])
+            first = self._bodies.of(place.world).start
             for i in place.soft:
                 body, number = place.setup.bodies[i], first + i
-                if not body.parameter_tracks or not self._started[number]:
+                if not body.parameter_tracks or not self._bodies.started[number]:
                     continue
                 material = body.material_at(float(middle[place.world]))
                 if self._followed.get(number) == material:
@@ -229,7 +218,7 @@ class WorldGroup:
                 if number not in self._shares:
                     choice = material_choice(body, float(self._times[place.world]) + SAME_TIME)
                     self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
-                offset, shares = int(self._offsets[number]), self._shares[number]
+                offset, shares = int(self._bodies.offsets[number]), self._shares[number]
                 self._engine.particles.set_moduli(offset, shares, material.shear_number, material.bulk_number)
                 self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
                 self._followed[number] = material
@@ -243,32 +232,29 @@ class WorldGroup:
         What wakes is in the engine from the present time on, as if it had started now.
         """
         until = np.full(len(self), math.inf)
+        watched = [place for place in self._places if self._bodies.may_wake(place.world)]
+        if not watched:
+            return until
+        speeds = self._engine.control()[:, layout.SPEED]
         fresh = []
-        control = None
-        for place in self._places:
-            world, sleepers = place.world, self._sleepers[place.world]
-            first, end = int(self._first_body[world]), int(self._first_body[world + 1])
-            asleep = self._asleep[first:end]
-            if sleepers is None or not asleep.any() or not self._started[first:end].any():
-                continue
-            control = self._engine.control() if control is None else control
-            now = float(self._times[world])
-            while True:
-                moving, speed = self._moving_matter(place, float(control[world, layout.SPEED]))
-                woken, rest = sleepers.touched(moving, asleep, now, speed)
-                if not woken:
-                    break
-                for i in sleepers.with_neighbours(woken, asleep):
-                    self._asleep[first + i], self._started[first + i] = False, True
-                    if place.setup.bodies[i].rigid:
-                        self._rigid_bodies.asleep.discard((world, place.setup.bodies[i].name))
-                    else:
-                        choice = material_choice(place.setup.bodies[i], now + SAME_TIME)
-                        fresh.append(packing.particles(place, i, int(self._offsets[first + i]), choice))
-            until[world] = now + max(rest, LEAST_WATCH)
+        for place in watched:
+            world, now = place.world, float(self._times[place.world])
+            moving = partial(self._moving_matter, place, float(speeds[world]))
+            woken, until[world] = self._bodies.wake(world, now, moving)
+            for i in woken:
+                body = place.setup.bodies[i]
+                if body.rigid:
+                    self._rigid_bodies.asleep.discard((world, body.name))
+                else:
+                    fresh.append(self._new_particles(place, i, now + SAME_TIME))
         if fresh:
             self._add(fresh)
         return until
+
+    def _new_particles(self, place: packing.WorldSlot, index: int, now: float) -> tuple[packing.NewParticles, float]:
+        """Return the particles of the world's body ``index`` as they start at ``now``; see ``packing.particles``."""
+        first = int(self._bodies.offsets[self._bodies.of(place.world).start + index])
+        return packing.particles(place, index, first, material_choice(place.setup.bodies[index], now))
 
     def _add(self, fresh: list[tuple[packing.NewParticles, float]]) -> None:
         """Let the engine have these particles, see ``packing.particles``; takes them out of the list."""
@@ -280,7 +266,7 @@ class WorldGroup:
     def _moving_matter(self, place: packing.WorldSlot, speed: float) -> tuple[dict[int, Array], float]:
         """Particles (N, 3) in world metres of the world's bodies that have started, by index, and the speed in m/s of
         the fastest of all; ``speed``: of the fastest particle of those that deform, cells/s."""
-        first = int(self._first_body[place.world])
+        first = self._bodies.of(place.world).start
         fastest = speed / place.cells.scale
         ids, cells = self._engine.places()
         order = np.argsort(ids)
@@ -288,7 +274,7 @@ class WorldGroup:
         found = {}
         for i, body in enumerate(place.setup.bodies):
             number = first + i
-            if not self._started[number]:
+            if not self._bodies.started[number]:
                 continue
             if body.rigid:
                 pose = self.pose(place.world, body.name)
@@ -296,14 +282,14 @@ class WorldGroup:
                 arm = float(np.linalg.norm(found[i] - pose.center, axis=1).max())
                 fastest = max(fastest, float(np.linalg.norm(pose.velocity) + np.linalg.norm(pose.spin) * arm))
                 continue
-            low, high = np.searchsorted(ids, (self._offsets[number], self._offsets[number + 1]))
+            low, high = np.searchsorted(ids, self._bodies.offsets[number : number + 2])
             # What has just woken is not in the engine yet, and at rest.
             found[i] = place.cells.points_to_world(cells[low:high]) if high > low else body.positions
         return found, fastest
 
     def asleep(self, number: int) -> bool:
         """Whether body ``number`` of all sleeps."""
-        return bool(self._asleep[number])
+        return bool(self._bodies.asleep[number])
 
     def _reach_times(self, before: Array) -> None:
         """Apply what starts at the worlds' present times, after ``before`` (W,): bodies, velocities, materials."""
@@ -311,19 +297,13 @@ class WorldGroup:
         moved = [place for place in self._places if self._times[place.world] > before[place.world]]
         for place in moved:
             now = float(self._times[place.world]) + SAME_TIME
-            for i, body in enumerate(place.setup.bodies):
-                number = int(self._first_body[place.world]) + i
-                if not self._started[number] and not self._asleep[number] and body.start_time <= now:
-                    self._started[number] = True
-                    if not body.rigid:
-                        choice = material_choice(body, now)
-                        fresh.append(packing.particles(place, i, int(self._offsets[number]), choice))
+            fresh += [self._new_particles(place, i, now) for i in self._bodies.start(place.world, now)]
         if fresh:
             self._add(fresh)
         for place in moved:
             now, then = float(self._times[place.world]) + SAME_TIME, float(before[place.world]) + SAME_TIME
             for i, body in enumerate(place.setup.bodies):
-                if self._started[int(self._first_body[place.world]) + i] and not body.rigid:
+                if self._bodies.started[self._bodies.of(place.world).start + i] and not body.rigid:
                     if any(then < time <= now for time, _ in body.material_track):
                         self._change_material(place, i, now)
                     velocity = velocity_due(body, then, now)
@@ -335,11 +315,11 @@ class WorldGroup:
         return material_choice(self.setups[world].bodies[index], float(self._times[world]) + SAME_TIME)
 
     def _rows_of(self, state: State, number: int) -> BodyRows:
-        return rows_of_body(state, int(self._offsets[number]), int(self._offsets[number + 1]))
+        return rows_of_body(state, int(self._bodies.offsets[number]), int(self._bodies.offsets[number + 1]))
 
     def _change_material(self, place: packing.WorldSlot, body_index: int, now: float) -> None:
         """Switch the body's particles to another material from now on; their history variables are reset."""
-        number = int(self._first_body[place.world]) + body_index
+        number = self._bodies.of(place.world).start + body_index
         self._shares.pop(number, None)
         self._followed.pop(number, None)
         state = self._engine.state()
@@ -351,7 +331,7 @@ class WorldGroup:
 
     def _set_velocity(self, place: packing.WorldSlot, body_index: int, velocity: Array) -> None:
         """Set the body's mean velocity, m/s."""
-        number = int(self._first_body[place.world]) + body_index
+        number = self._bodies.of(place.world).start + body_index
         state = self._engine.state()
         fastest = set_mean_velocity(state, self._rows_of(state, number), velocity * place.cells.scale)
         self._engine.replace(state)
@@ -371,7 +351,7 @@ class WorldGroup:
         """Set the state of every particle of body ``index`` of world ``world``; see ``World.set_motion``."""
         number = self.body_number(world, index)
         place, body = self._places[world], self.setups[world].bodies[index]
-        if body.rigid or not self._started[number]:
+        if body.rigid or not self._bodies.started[number]:
             kind = "is rigid" if body.rigid else "has not started"
             raise InputError(f"body {body.name!r} {kind}: give motion to bodies of particles that have started")
         given = checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
@@ -429,13 +409,13 @@ class WorldGroup:
 
     def started(self, number: int) -> bool:
         """Whether body ``number`` of all has entered the simulation."""
-        return bool(self._started[number])
+        return bool(self._bodies.started[number])
 
     def body_number(self, world: int, index: int) -> int:
         """Number among all bodies of body ``index`` of world ``world``. Raises InputError when there is none."""
         if not 0 <= index < len(self.setups[world].bodies):
             raise InputError(f"body index is {index}: give 0 to {len(self.setups[world].bodies) - 1}")
-        return int(self._first_body[world]) + index
+        return self._bodies.of(world).start + index
 
     def fitted(self, number: int, rest: Array) -> FittedGradients:
         """The fit of deformation gradients to body ``number`` of all, whose places at rest are ``rest``."""
@@ -445,7 +425,7 @@ class WorldGroup:
 
     def gather(self, name: str, number: int, resting: Array) -> Array:
         """Values of body ``number`` of all in the order of its particles; ``resting`` where it has not started."""
-        if not self._started[number]:
+        if not self._bodies.started[number]:
             return resting
         state = self.state()
         rows = self._rows_of(state, number)
@@ -460,10 +440,10 @@ class WorldGroup:
         del state["position"]
         state["format"] = np.array(CHECKPOINT_FORMAT)
         state["times"] = self._times.copy()
-        state["started"] = self._started.copy()
-        if any(sleepers is not None for sleepers in self._sleepers):
-            state["asleep"] = self._asleep.copy()
-        state["offsets"] = self._offsets.astype(np.int64)
+        state["started"] = self._bodies.started.copy()
+        if self._bodies.any_may_sleep:
+            state["asleep"] = self._bodies.asleep.copy()
+        state["offsets"] = self._bodies.offsets.astype(np.int64)
         state["similarity"] = np.array([self.similarity.scale, *self.similarity.origin])
         state["grid"] = np.array(self.options.grid)
         if self._rigid_bodies.count:
@@ -480,7 +460,7 @@ class WorldGroup:
         if int(checkpoint["format"]) != CHECKPOINT_FORMAT:
             raise InputError(f"checkpoint format is {int(checkpoint['format'])}: this engine reads {CHECKPOINT_FORMAT}")
         same = (
-            np.array_equal(checkpoint["offsets"], self._offsets)
+            np.array_equal(checkpoint["offsets"], self._bodies.offsets)
             and np.array_equal(checkpoint["similarity"], [self.similarity.scale, *self.similarity.origin])
             and int(checkpoint["grid"]) == self.options.grid
             and len(checkpoint["times"]) == len(self)
@@ -488,8 +468,9 @@ class WorldGroup:
         if not same:
             raise InputError("checkpoint is of another scene: bodies, similarity and grid must be the same")
         self._times = np.array(checkpoint["times"], dtype=np.float64)
-        self._started = np.array(checkpoint["started"], dtype=bool)
-        self._asleep = np.array(checkpoint.get("asleep", np.zeros(len(self._started))), dtype=bool)
+        self._bodies.started = np.array(checkpoint["started"], dtype=bool)
+        asleep = checkpoint.get("asleep", np.zeros(len(self._bodies.started)))
+        self._bodies.asleep = np.array(asleep, dtype=bool)
         self._rigid_bodies = self._new_rigid_bodies()
         if self._rigid_bodies.count:
             rigid_bodies = {
