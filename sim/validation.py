@@ -190,6 +190,11 @@ def _brief(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def finite_or_none(value: float) -> float | None:
+    """Return ``value``, None where it is not finite, which JSON has no number for."""
+    return value if math.isfinite(value) else None
+
+
 def to_json(value: Any) -> Any:
     """Return the JSON form of a dataclass; ``parse`` returns the equal object."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

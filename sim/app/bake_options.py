@@ -65,7 +65,7 @@ class BakeOptions:
 
     @property
     def rate(self) -> float:
-        """Frames per second of the scene's own time."""
+        """Return frames per second of the scene's own time."""
         return self.fps * self.slow
 
 

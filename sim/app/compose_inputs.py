@@ -104,12 +104,12 @@ class ComposeObject:
 
     @property
     def name(self) -> str:
-        """The object's name."""
+        """Return the object's name."""
         return self.item.name
 
     @property
     def size(self) -> float:
-        """Longest side of its bounding box in metres."""
+        """Return the longest side of its bounding box in metres."""
         return float(np.ptp(self.surface.vertices, axis=0).max())
 
 

@@ -83,7 +83,7 @@ class Thing:
 
     @property
     def tall(self) -> float:
-        """Height in m."""
+        """Return the height in m."""
         return self.heights[1] - self.heights[0]
 
     def extent(self, direction: Array) -> float:
@@ -91,7 +91,7 @@ class Thing:
         return float(np.ptp(self.hull @ direction))
 
     def tips(self, way: Array, up: Array) -> float:
-        """Return by how many radians it leans, at most, along the level unit vector ``way`` before it falls over."""
+        """Return by how many radians it leans, at most, along the level unit vector ``way`` (2,) before it falls."""
         across = np.cross(up, way)
         # Where the base ends along a narrow strip in that direction; a narrow base ends soon, whatever its length.
         foot = (self.base - self.centre) @ np.stack([way, across], axis=1)

@@ -36,17 +36,17 @@ class Move:
 
     @property
     def landed_s(self) -> float:
-        """When it comes down, or stops."""
+        """Return the time in s at which it comes down, or stops."""
         return self.start_s + self.flight_s
 
     @property
     def slides(self) -> bool:
-        """Whether it is a push."""
+        """Return whether it is a push."""
         return self.height == 0.0
 
     @property
     def on_the_spot(self) -> bool:
-        """Whether it is a hop straight up."""
+        """Return whether it is a hop straight up."""
         return not self.slides and not any(self.aside)
 
     def slower(self, share: float) -> Move:

@@ -118,7 +118,7 @@ class _Inbox:
 
     @property
     def reading(self) -> bool:
-        """Whether the thread is still waiting for input."""
+        """Return whether the thread is still waiting for input."""
         return not self._ended
 
     def next(self) -> PreviewRequest | None:

@@ -35,7 +35,7 @@ from ..skinning import Binding, bind, deform
 from .bake_options import BakeOptions
 from .preview_server import PreviewRequest
 from .scene_to_world import PreparedWorld, prepare_world
-from .scene_to_world_checks import cell_size, mesh_volume, moves, vertices_at
+from .scene_to_world_checks import cell_size, mesh_volume, vertices_at
 from .simulation import Simulation, start_world
 
 MAX_VERTICES = 20_000
@@ -323,7 +323,7 @@ def _shown(scene: SceneModel, simulation: Simulation, proxies: list[ProxyMesh]) 
         collider = simulation.prepared.collider_of_object[slot]
         if body is not None and rest is not None:
             found.append((item.name, small, _follower(simulation, body, bind(small.vertices, rest))))
-        elif collider is not None and moves(colliders[collider]) and colliders[collider].vertices is None:
+        elif collider is not None and colliders[collider].moves and colliders[collider].vertices is None:
             found.append((item.name, small, _driven(simulation, collider, small)))
     return found
 

@@ -57,7 +57,7 @@ class PreparedWorld:
 
     @property
     def particle_count(self) -> int:
-        """Particles of all bodies that deform."""
+        """Return the number of particles of all bodies that deform."""
         return _soft_count(self.setup)
 
     def require_affordable(self) -> None:

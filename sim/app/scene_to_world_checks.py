@@ -36,11 +36,6 @@ from ..scene.model import Ground
 from ..scene.units import Similarity
 
 
-def moves(collider: Collider) -> bool:
-    """Return whether ``collider`` ever moves."""
-    return any(track is not None for track in (collider.translations, collider.rotations, collider.vertices))
-
-
 def vertices_at(collider: Collider, time: float) -> NDArray[np.float64]:
     """Return the vertices (V, 3) of ``collider`` in world metres at ``time`` in s."""
     if collider.vertices is not None:
@@ -251,7 +246,7 @@ def _out_of_collider(
     if depth <= DEEPEST_CELLS * coarse:
         return body, collider, f"{body.name} stands {depth * 1000:.2g} mm in {collider.name} and will be pushed out"
     deep = f"{body.name} is {depth * 1000:.2g} mm deep in {collider.name} at the start"
-    if not moves(collider) and body.surface is not None:
+    if not collider.moves and body.surface is not None:
         hollow = _hollowed(collider.surface, body.surface, spacing)
         if hollow is not None:
             return body, dataclasses.replace(collider, surface=hollow), f"{deep}: {collider.name} has a hollow there"

@@ -14,7 +14,7 @@ from ..events import StageProgress
 from ..mpm.world import World
 from .scene_bodies import engine_material
 from .scene_to_world import PreparedWorld, cost_text, steps_text
-from .scene_to_world_checks import moves, vertices_at
+from .scene_to_world_checks import vertices_at
 
 __all__ = ["ENGINE_NAME", "Simulation", "build_world", "engine_material"]
 
@@ -35,28 +35,31 @@ class Simulation:
 
     @property
     def body_of_object(self) -> tuple[int | None, ...]:
-        """For each object of the scene its body in ``world``, None for colliders."""
+        """Return for each object of the scene its body in ``world``, None for colliders."""
         return self.prepared.body_of_object
 
     @property
     def particle_count(self) -> int:
-        """Particles of all bodies."""
+        """Return the number of particles of all bodies."""
         return self.prepared.particle_count
 
     @property
     def engine_name(self) -> str:
-        """Engine and where it runs, as the manifest names them."""
+        """Return the engine and where it runs, as the manifest names them."""
         return f"{ENGINE_NAME}/{self.world.arch}"
 
     def collider_vertices(self, slot: int) -> NDArray[np.float64] | None:
         """Return the vertices (V, 3) of the moving collider that object ``slot`` is, world metres; None for others."""
         index = self.prepared.collider_of_object[slot]
-        if index is None or not moves(self.prepared.setup.colliders[index]):
+        if index is None or not self.prepared.setup.colliders[index].moves:
             return None
         return vertices_at(self.prepared.setup.colliders[index], self.world.time)
 
     def metrics(self) -> dict[str, Any]:
-        """Of now: energies in J, momentum in kg m/s, gap to the ground in m (below 0 under it, None without)."""
+        """Return the present metrics: energies in J, momentum in kg m/s, gap to the ground in m.
+
+        The gap is below 0 under the ground, and None without one.
+        """
         energy = self.world.energy()
         bodies = range(len(self.world.bodies))
         return {

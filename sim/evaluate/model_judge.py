@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..events import IsCancelled, never
 from ..reconstruct.reasoning.chat_client import ChatRequest, Wording, complete_content
 from ..reconstruct.reasoning.material_query import jpeg_bytes
-from ..validation import quantity, require_quantities
+from ..validation import finite_or_none, quantity, require_quantities
 from .judge_question import CRITERIA, MAX_PROMPT, MAX_TEXT, MOST_VIDEOS, ReadAnswer, question, read_scores
 
 _WORDING = Wording(sent="frames", lost="the videos were not judged")
@@ -97,7 +97,11 @@ class Judgement:
             "temperature": self.options.temperature,
             "videos": {
                 video: {
-                    name: {"mean": _finite(score.mean), "spread": _finite(score.spread), "values": list(score.values)}
+                    name: {
+                        "mean": finite_or_none(score.mean),
+                        "spread": finite_or_none(score.spread),
+                        "values": list(score.values),
+                    }
                     for name, score in of.items()
                 }
                 for video, of in self.scores.items()
@@ -106,10 +110,6 @@ class Judgement:
             "answers": [list(answers) for answers in self.answers],
             "notes": list(self.notes),
         }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def evenly_sampled(count: int, wanted: int) -> NDArray[np.int64]:

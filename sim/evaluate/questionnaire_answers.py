@@ -20,7 +20,7 @@ from ..atomic import replacing_tree, write_bytes, write_json
 from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..files import shown, without_folder
-from ..validation import quantity, read_json, require_quantities
+from ..validation import finite_or_none, quantity, read_json, require_quantities
 from ..version import VERSION
 from .evaluation import no_formula
 from .judge_question import CRITERIA, TITLES
@@ -260,7 +260,10 @@ def collect_questionnaire(
         "means": _means(table, videos, options),
         "preferences": _preferences(table, videos),
         "agreement": [
-            {"criterion": name, **{level: _finite(krippendorff_alpha(_units(table, k), level)) for level in LEVELS}}
+            {
+                "criterion": name,
+                **{level: finite_or_none(krippendorff_alpha(_units(table, k), level)) for level in LEVELS},
+            }
             for k, name in enumerate(CRITERIA)
         ],
         "notes": notes,
@@ -288,7 +291,12 @@ def _means(table: Array, videos: list[str], options: CollectOptions) -> list[dic
             count = int(np.isfinite(scores).sum())
             low, high = bootstrap_interval(scores, options) if count else (math.nan, math.nan)
             mean = float(np.nanmean(scores)) if count else math.nan
-            values = {"mean": _finite(mean), "low": _finite(low), "high": _finite(high), "count": count}
+            values = {
+                "mean": finite_or_none(mean),
+                "low": finite_or_none(low),
+                "high": finite_or_none(high),
+                "count": count,
+            }
             rows.append({"video": video, "criterion": criterion, **values})
     return rows
 
@@ -316,10 +324,6 @@ def _preferences(table: Array, videos: list[str]) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _csv(sheets: list[Sheet], cases: list[dict[str, Any]]) -> bytes:

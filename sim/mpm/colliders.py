@@ -128,6 +128,11 @@ class Collider:
             raise InputError(f"collider {self.name!r}: pivot is {self.pivot!r}: give three finite numbers")
 
     @property
+    def moves(self) -> bool:
+        """Whether it ever moves."""
+        return any(track is not None for track in (self.translations, self.rotations, self.vertices))
+
+    @property
     def middle(self) -> Array:
         """World point (3,) about which it rotates."""
         if self.pivot is not None:

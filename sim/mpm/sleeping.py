@@ -136,7 +136,7 @@ class Sleepers:
         if not wanted or setup.gravity_track is not None or not down.any():
             return
         self._up = -down / np.linalg.norm(down)
-        swept = [_swept_box(collider) for collider in setup.colliders if _moves(collider)]
+        swept = [_swept_box(collider) for collider in setup.colliders if collider.moves]
         wanted = [i for i in wanted if not any(self._meets(i, *box) for box in swept)]
         self.asleep[self._standing(wanted)] = True
 
@@ -190,7 +190,7 @@ class Sleepers:
             if steep < math.pi / 2 and math.tan(steep) <= self.setup.contact(body.name, GROUND_NAME).sticking:
                 places.append(shape.points[heights < NEAR_GROUND * self.cell])
         for collider in self.setup.colliders:
-            if not _moves(collider):
+            if not collider.moves:
                 found = self._on_collider(shape, collider)
                 if found is not None:
                     places.append(found.places[found.normals @ self._up > CARRIES])
@@ -291,10 +291,6 @@ def _quiet(forces: BodyForces) -> bool:
     """Whether ``forces`` do nothing to a body at rest but change its weight."""
     blown = any(forces.wind) and (forces.drag != 0 or forces.lift != 0)
     return forces.gravity_factor > 0 and not blown and forces.tether_stiffness == 0
-
-
-def _moves(collider: Collider) -> bool:
-    return any(track is not None for track in (collider.translations, collider.rotations, collider.vertices))
 
 
 def _swept_box(collider: Collider) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from ..capture import Capture
 from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
 from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
 from .diagnosis_figures import Pictures, draw_pictures, gap_bars
-from .number_format import counted, estimate_text, number_text, percent_text, quantity_text
+from .number_format import counted, estimate_text, finite_or_zero, number_text, percent_text, quantity_text
 from .object_heatmaps import VIEWS
 from .wording import (
     DIRECTIONS,
@@ -99,13 +99,13 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
     name = "" if diagnosis.provenance is None else shortened(diagnosis.provenance.capture or "", 60)
     alike = [item for item in effects if item.reason == SAME]
     others = [item for item in effects if item.reason != SAME]
-    shown = [item for i, item in enumerate(others) if i < ALWAYS or _finite(item.probability) >= LEAST]
+    shown = [item for i, item in enumerate(others) if i < ALWAYS or finite_or_zero(item.probability) >= LEAST]
     folded = others[len(shown) :]
     if diagnosis.pair is not None:
         # One line for two causes that were found together.
         shown = [i for i in shown if i.name not in diagnosis.pair.effects]
         folded = [i for i in folded if i.name not in diagnosis.pair.effects]
-    intervals = sorted(diagnosis.where.intervals, key=lambda i: -_finite(i.share))[:MAX_ROWS]
+    intervals = sorted(diagnosis.where.intervals, key=lambda i: -finite_or_zero(i.share))[:MAX_ROWS]
     kinds = {item.name: item.kind for item in effects}
     observed = [effect_label(name) for name in found_effects(verdict) if kinds.get(name) == "observation"]
     notes = [*control_sentences(diagnosis), *diagnosis.warnings, *capture.warnings]
@@ -128,9 +128,9 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         objects=_object_rows(pictures),
         shown=shown,
         folded=folded,
-        folded_probability=sum(_finite(item.probability) for item in folded),
+        folded_probability=sum(finite_or_zero(item.probability) for item in folded),
         alike=listed([effect_label(item.name) for item in alike], "and"),
-        alike_probability=sum(_finite(item.probability) for item in alike),
+        alike_probability=sum(finite_or_zero(item.probability) for item in alike),
         pair=diagnosis.pair,
         provenance=diagnosis.provenance,
         closure=closure_sentence(diagnosis),
@@ -151,7 +151,7 @@ def render_page(diagnosis: Diagnosis, capture: Capture, pictures: Pictures) -> s
         ],
         marks=_MARKS,
         bar_class=bar_class,
-        bar_width=lambda probability: short_number(max(min(_finite(probability), 1.0) * _BAR, 1.0)),
+        bar_width=lambda probability: short_number(max(min(finite_or_zero(probability), 1.0) * _BAR, 1.0)),
         effect_label=effect_label,
         estimate_text=estimate_text,
         length=lambda value: quantity_text(value, "m"),
@@ -207,7 +207,7 @@ def _shares(diagnosis: Diagnosis, *, several: bool) -> list[str]:
     where = diagnosis.where
     phases: dict[str, float] = {}
     for interval in where.intervals:
-        phases[interval.phase] = phases.get(interval.phase, 0.0) + _finite(interval.share)
+        phases[interval.phase] = phases.get(interval.phase, 0.0) + finite_or_zero(interval.share)
     groups: tuple[tuple[str, Iterable[tuple[str, float]]], ...] = (
         ("Discrepancy by phase", ((PHASES.get(phase, phase), share) for phase, share in phases.items())),
         ("Direction of the missing force", ((DIRECTIONS.get(n, n), s) for n, s in where.direction.items())),
@@ -249,7 +249,3 @@ def _value(value: object) -> str:
     if isinstance(value, float | int):
         return number_text(float(value), digits=4)
     return shortened(value, 200)
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else 0.0

@@ -34,6 +34,11 @@ def quantity_text(value: float | None, unit: str, *, digits: int = 3) -> str:
     return with_unit(number_text(value * factor, digits=digits), name)
 
 
+def finite_or_zero(value: float) -> float:
+    """Return ``value``, 0 where it is not finite."""
+    return value if math.isfinite(value) else 0.0
+
+
 def counted(number: int, what: str) -> str:
     """Return "1 trial" or "3 trials"."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"

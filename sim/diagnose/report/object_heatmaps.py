@@ -21,7 +21,7 @@ from ...html import Markup, Picture, element, join, label, shortened
 from ..capture import Capture, CaptureObject
 from ..diagnosis import Diagnosis
 from .diagnosis_charts import round_up
-from .number_format import counted, number_text, percent_text, tick_text
+from .number_format import counted, finite_or_zero, number_text, percent_text, tick_text
 
 Array = NDArray[np.float64]
 
@@ -265,7 +265,7 @@ def _merged(points: Array, means: Array) -> Scores:
 def object_pictures(diagnosis: Diagnosis, capture: Capture) -> list[Picture]:
     """Return two views of every object shown, then the legend, all on one colour scale from 0."""
     shares = {o.name: o.share for o in diagnosis.where.objects}
-    order = sorted(range(len(capture.objects)), key=lambda i: -_finite(shares.get(capture.objects[i].name, 0.0)))
+    order = sorted(range(len(capture.objects)), key=lambda i: -finite_or_zero(shares.get(capture.objects[i].name, 0.0)))
     chosen = [(capture.objects[i], object_scores(diagnosis, capture, i)) for i in order[:MAX_OBJECTS]]
     largest = max((float(s.means.max()) for _, s in chosen if len(s.means)), default=0.0)
     top = round_up(largest)
@@ -412,7 +412,3 @@ def _legend(top: float) -> Picture:
         description=f"From 0 (dark violet) to {number_text(top)} m/s² (light yellow). Dots are tracked points.",
         body=join([label("mean missing force per mass, m/s²", 0, 12, class_="quiet"), *bar, *ticks]),
     )
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else 0.0

@@ -132,7 +132,7 @@ class LocalLighting:
 
     @property
     def ground_radiance(self) -> Points:
-        """RGB (3,) of ground in open light."""
+        """Return the radiance RGB (3,) of ground in open light."""
         return self.ground
 
 
@@ -212,7 +212,7 @@ class Shading:
 
     @property
     def total(self) -> Points:
-        """Brightness (N, 3) of a white matt surface."""
+        """Return the brightness (N, 3) of a white matt surface."""
         return self.ambient + self.sun[:, None]
 
 

@@ -123,7 +123,7 @@ class _Axis:
 
     @property
     def white(self) -> float:
-        """White light along the axis."""
+        """Return white light along the axis."""
         return float(self.unit.sum())
 
 
@@ -140,7 +140,7 @@ class Observed:
 
     @property
     def count(self) -> int:
-        """Number of observations."""
+        """Return the number of observations."""
         return sum(int((axis.weight > 0).sum()) for axis in self.axes)
 
     @classmethod

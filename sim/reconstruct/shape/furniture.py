@@ -415,7 +415,7 @@ class BoardField(RayField):
         return best, world[:, 2] / self.unit
 
     def value(self, points: Points) -> Points:
-        """φ (n) at ``points`` (n, 3)."""
+        """Return φ (n,) at ``points`` (n, 3)."""
         body, ground = self.sample(points)
         return np.minimum(body, ground)
 

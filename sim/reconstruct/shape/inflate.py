@@ -59,12 +59,12 @@ class Silhouette:
 
     @property
     def half_thickness(self) -> float:
-        """Largest h in pixels."""
+        """Return the largest height of the surface over the mask's plane, pixels."""
         return float(np.sqrt(max(self.square_height.max(), 0.25)))
 
 
 def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
-    """Inflate ``mask`` (H, W), which must not be empty.
+    """Return ``mask`` (H, W), which must not be empty, inflated.
 
     thickness: depth over width of the body; None uses 1 for round masks and 0.2 for boxes.
     """
@@ -90,8 +90,8 @@ def inflate(mask: Mask, thickness: float | None = None) -> Silhouette:
 
 
 def signed_distance(mask: Mask) -> Field:
-    """Return the signed distance in pixels of each pixel's centre to the outline of ``mask``, positive inside, without
-    stair-steps."""
+    """Return the signed distance (H, W) in pixels of each pixel's centre to the outline of ``mask`` (H, W), positive
+    inside, without stair-steps."""
     inside, outside = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
     exact = np.where(mask, inside - 0.5, 0.5 - outside)
     smooth = ndimage.gaussian_filter(exact, 1.0)
@@ -101,7 +101,7 @@ def signed_distance(mask: Mask) -> Field:
 
 
 def is_box(mask: Mask) -> bool:
-    """Return whether ``mask`` fills its smallest rotated rectangle, and is not elongated like a stick."""
+    """Return whether ``mask`` (H, W) fills its smallest rotated rectangle, and is not elongated like a stick."""
     points = cv2.findNonZero(mask.astype(np.uint8))
     if points is None:
         return False

@@ -111,7 +111,7 @@ class _DepthField:
         return np.asarray(square - np.where(t > 0, gentle * t / self._back, steep * t) ** 2)
 
     def value(self, points: Points) -> Points:
-        """φ (n) at ``points`` (n, 3)."""
+        """Return φ (n,) at ``points`` (n, 3)."""
         film, ground = self.sample(points)
         return np.minimum(film, ground)
 

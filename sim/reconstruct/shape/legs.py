@@ -49,7 +49,7 @@ class Leg:
 
     @property
     def straight(self) -> bool:
-        """Whether its sides are straight, and it is as wide above as below."""
+        """Return whether its sides are straight, and it is as wide above as below."""
         ends = len(self.rows) // 8
         keep = slice(min(ends, 4), len(self.rows) - ends)
         rows, left, right = (side[keep].astype(np.float64) for side in (self.rows, self.left, self.right))
@@ -74,7 +74,7 @@ class Leg:
 
 
 def outline_size(mask: Mask) -> float:
-    """Return the longer side of the bounding box of ``mask`` in pixels."""
+    """Return the longer side in pixels of the bounding box of ``mask`` (H, W)."""
     return float(max(np.ptp(np.flatnonzero(mask.any(axis=axis))) for axis in (0, 1)) + 1)
 
 

@@ -257,12 +257,12 @@ class Body:
 
     @property
     def extent(self) -> float:
-        """Largest extent along the world's axes, in the camera's unit."""
+        """Return the largest extent along the world's axes, in the camera's unit."""
         return float(np.ptp(self.surface.vertices, axis=0).max())
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width, the mean of both directions, and height, in the camera's unit."""
+        """Return width, the mean of both directions, and height, in the camera's unit."""
         x, y, z = (float(v) for v in np.ptp(self.surface.vertices, axis=0))
         return (x * y) ** 0.5, z
 
@@ -427,7 +427,7 @@ def _separated(
 
 
 def shadow_casters(view: Camera, full: Sequence[Mask], bodies: Sequence[Body]) -> list[TriangleMesh]:
-    """Meshes that cast the shadows: plain inflated masks for inflated bodies, the bodies' own surfaces otherwise.
+    """Return the meshes that cast shadows: of inflated bodies their masks inflated plainly, else their own surfaces.
 
     An inflated body is moved back until it stands, so its shadow would be displaced; one that hangs is not.
     """

@@ -226,7 +226,7 @@ class PlacedBody:
 
     @property
     def extent(self) -> float:
-        """Largest extent along the world's axes."""
+        """Return the largest extent along the world's axes, in the camera's unit."""
         return float(np.ptp(self.vertices, axis=0).max())
 
 
@@ -323,7 +323,7 @@ class _Pair:
 
     @property
     def overlap(self) -> bool:
-        """Whether the front body reaches into the one behind, or beyond it, along any ray."""
+        """Return whether the front body reaches into the one behind, or beyond it, along any ray."""
         return bool((self._shared() > 0).any())
 
     def _shared(self) -> Points:
@@ -334,7 +334,7 @@ class _Pair:
         return np.asarray(ndimage.maximum_filter(shared, 3))
 
     def front_thinned(self) -> Points:
-        """Depths (V,) of the front body's vertices, its far side in front of the other where it has that much room."""
+        """Return depths (V,) of the front body's vertices, its far side in front of the other where there is room."""
         near, far = self.front_range
         shared = self._shared()
         with np.errstate(invalid="ignore"):
@@ -343,7 +343,7 @@ class _Pair:
         return np.minimum(self.front[:, 2], self._at(limit, self.front, np.inf))
 
     def behind_receded(self, camera: Camera) -> Points:
-        """Depths (V,) of the other body's vertices, all of them behind the front body, none below the ground."""
+        """Return depths (V,) of the other body's vertices, all of them behind the front body, none below the ground."""
         near, far = self.behind_range
         shared = self._shared()
         with np.errstate(invalid="ignore"):

@@ -319,7 +319,7 @@ class SolidField(RayField):
 
     @property
     def thinnest(self) -> float:
-        """Pixels of the thinnest extent that the grid must resolve."""
+        """Return pixels of the thinnest extent that the grid must resolve."""
         thin = self._primitive.least_extent / self.unit
         return thin if self._square is None else min(thin, 2.0 * self._half)
 
@@ -345,7 +345,7 @@ class SolidField(RayField):
         return np.minimum(body, outline), ground
 
     def value(self, points: Points) -> Points:
-        """φ (n) at ``points`` (n, 3)."""
+        """Return φ (n,) at ``points`` (n, 3)."""
         body, ground = self.sample(points)
         return soft_min(body, ground, self._base_bevel)
 

@@ -119,23 +119,23 @@ SUNK = 0.01
 
 
 class Primitive(Protocol):
-    """A parametric body. ``name`` is its shape's name."""
+    """A parametric body that stands on the ground z = 0; lengths in the camera's unit, points in world axes."""
 
     @property
     def name(self) -> str:
-        """``box``, ``cylinder`` or ``sphere``."""
+        """Return the name of its shape: ``box``, ``cylinder`` or ``sphere``."""
 
     @property
     def height(self) -> float:
-        """Height of its top above the ground."""
+        """Return the height of its top above the ground."""
 
     @property
     def centre(self) -> Points:
-        """(3,) its middle."""
+        """Return its middle (3,)."""
 
     @property
     def least_extent(self) -> float:
-        """Its smallest extent."""
+        """Return its smallest extent."""
 
     def pieces(self, camera: Camera) -> list[Points]:
         """Return points (n, 3) of convex pieces: the union of the pieces' projected hulls is the outline."""
@@ -166,17 +166,17 @@ class Box:
 
     @property
     def centre(self) -> Points:
-        """(3,) its middle."""
+        """Return its middle (3,)."""
         return np.array([self.x, self.y, self.height / 2.0])
 
     @property
     def least_extent(self) -> float:
-        """Its smallest extent."""
+        """Return its smallest extent."""
         return min(self.width, self.depth, self.height)
 
     @property
     def axes(self) -> tuple[Points, Points]:
-        """Unit vectors (2,) of width and depth in the ground."""
+        """Return the unit vectors (2,) of width and depth in the ground."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([cosine, sine]), np.array([-sine, cosine])
 
@@ -190,11 +190,11 @@ class Box:
         return np.column_stack([ground, (bits >> 2) * self.height])
 
     def pieces(self, camera: Camera) -> list[Points]:
-        """Its corners."""
+        """Return its corners (8, 3), one piece."""
         return [self.corners()]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Return the distance from the nearest face, soft where two are equally near."""
+        """Return the distance (n,) from the nearest face, soft where two are equally near."""
         across, along = self.axes
         offset = points[:, :2] - np.array([self.x, self.y])
         sides = soft_min(
@@ -215,26 +215,26 @@ class Sphere:
 
     @property
     def centre(self) -> Points:
-        """(3,) its middle."""
+        """Return its middle (3,)."""
         return np.array([self.x, self.y, self.squash * self.radius * (1.0 - SUNK)])
 
     @property
     def height(self) -> float:
-        """Of its top."""
+        """Return the height of its top above the ground."""
         return self.squash * self.radius * (2.0 - SUNK)
 
     @property
     def least_extent(self) -> float:
-        """Its smallest diameter."""
+        """Return its smallest diameter."""
         return 2.0 * self.radius * min(1.0, self.squash)
 
     @property
     def axes(self) -> Points:
-        """Semi-axes (3,)."""
+        """Return its semi-axes (3,) along x, y and z."""
         return self.radius * np.array([1.0, 1.0, self.squash])
 
     def pieces(self, camera: Camera) -> list[Points]:
-        """Return the ellipse in which the cone of sight touches it."""
+        """Return points (CIRCLE, 3) of the ellipse in which the cone of sight touches it, one piece."""
         # In units of its semi-axes it is a unit sphere, and lines stay lines.
         towards = (self.centre - camera.position) / self.axes
         distance = float(np.linalg.norm(towards))
@@ -247,7 +247,7 @@ class Sphere:
         return [self.centre + self.axes * (ring * np.sqrt(1.0 - sine**2) - axis * sine)]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Return the distance from the surface; exact on it."""
+        """Return the distance (n,) from the surface, to first order: exact on it (Taubin, PAMI 1991)."""
         scaled = (points - self.centre) / self.axes
         length = np.linalg.norm(scaled, axis=1)
         slope = np.linalg.norm(scaled / self.axes, axis=1) / np.maximum(length, 1e-12)
@@ -269,17 +269,17 @@ class SurfaceOfRevolution:
 
     @property
     def centre(self) -> Points:
-        """(3,) the middle of its axis."""
+        """Return the middle (3,) of its axis."""
         return np.array([self.x, self.y, self.height / 2.0])
 
     @property
     def height(self) -> float:
-        """Of its top."""
+        """Return the height of its top above the ground."""
         return self.heights[-1]
 
     @property
     def least_extent(self) -> float:
-        """Its height or its largest diameter."""
+        """Return its height or its largest diameter, whichever is smaller."""
         return min(self.height, 2.0 * max(self.radii))
 
     def circle(self, height: float, radius: float) -> Points:
@@ -291,12 +291,12 @@ class SurfaceOfRevolution:
         return points
 
     def pieces(self, camera: Camera) -> list[Points]:
-        """One frustum between every two heights."""
+        """Return the rims (2 · CIRCLE, 3) of the frustum between every two heights."""
         rings = [self.circle(h, r) for h, r in zip(self.heights, self.radii, strict=True)]
         return [np.concatenate(pair) for pair in pairwise(rings)]
 
     def inside(self, points: Points, rounding: float) -> Points:
-        """Return the distance from the mantle or the top, soft where both are equally near."""
+        """Return the distance (n,) from the mantle or the top, soft where both are equally near."""
         heights, radii = np.array(self.heights), np.array(self.radii)
         slopes = np.diff(radii) / np.maximum(np.diff(heights), 1e-12)
         z = points[:, 2]

@@ -60,24 +60,24 @@ class SupportMargin:
 
     @property
     def steadiness(self) -> float:
-        """The margin over the one that the base allows: 1 for a cube, negative for what topples, -1 without a base."""
+        """Return the margin over the one that the base allows: 1 for a cube, below 0 if it topples, -1 without base."""
         return max(self.margin / self.inradius, -1.0) if self.inradius > 0.0 else -1.0
 
     @property
     def share(self) -> float:
-        """The margin over the one that the body should have."""
+        """Return the margin over the one that the body should have."""
         return self.margin / self.wanted
 
     @property
     def cell(self) -> float:
-        """Side of a grid cell when the body is simulated alone in the coarsest quality."""
+        """Return the side of a grid cell when the body is simulated alone in the coarsest quality."""
         quality = load_quality(COARSEST)
         filled = (self.volume * quality.particles_per_cell / quality.particles) ** (1 / 3)
         return float(min(filled, self.longest / quality.smallest_cells))
 
     @property
     def wanted(self) -> float:
-        """The margin that the body should have."""
+        """Return the margin that the body should have."""
         return max(MARGIN_CELLS * self.cell, MARGIN_HEIGHT * self.height)
 
 

@@ -59,7 +59,7 @@ class Field(Protocol):
         """Return body (n) and ground (n) at ``points`` (n, 3): φ is the smaller one."""
 
     def value(self, points: Points) -> Points:
-        """φ (n) at ``points`` (n, 3)."""
+        """Return φ (n,) at ``points`` (n, 3)."""
 
     def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points, Points]:
         """Return φ on a grid of about ``spacing`` pixels, negative on its border, its first corner (3,) and its steps
