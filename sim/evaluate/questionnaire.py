@@ -27,7 +27,8 @@ from ..diagnose.track.video_file import Video
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file, open_file, read_toml, shown
-from ..html import FONT, PALETTES, Markup, page_head, render
+from ..html import Markup, page_head, render
+from ..page_style import FONT, PALETTES
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .judge_question import CRITERIA, MAX_PROMPT, MOST_VIDEOS, TITLES

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..diagnose.report.diagnosis_charts import Scale
-from ..html import Markup, Picture, element, join, label, page_head, page_style, render, shortened
+from ..html import Markup, Picture, element, join, label, page_head, render, shortened
+from ..page_style import page_style
 from .judge_question import CRITERIA, TITLES
 
 PAGE_FILE = "report.html"

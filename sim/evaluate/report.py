@@ -13,7 +13,8 @@ import numpy as np
 
 from ..atomic import write_bytes
 from ..diagnose.report.diagnosis_charts import Scale, curve, round_up
-from ..html import Markup, Picture, element, join, label, page_head, page_style, prose, render, shortened
+from ..html import Markup, Picture, element, join, label, page_head, prose, render, shortened
+from ..page_style import page_style
 from ..version import VERSION
 from .evaluation import HIGHER, LOWER, PAGE_FILE, Curve, Evaluation, Measure, Section, value_text
 from .footage import Footage, Frame, reduced

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..errors import InputError
-from ..html import page_head, page_style, prose, render
+from ..html import page_head, prose, render
+from ..page_style import page_style
 from ..scene.environment import read_environment
 from ..scene.folder import Scene
 from ..scene.model import SceneObject

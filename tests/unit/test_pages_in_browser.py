@@ -13,7 +13,8 @@ from physgen.sim.evaluate.evaluation import HIGHER, LOWER, Curve, Evaluation, Me
 from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.evaluate.questionnaire_report import result_page
 from physgen.sim.evaluate.report import page
-from physgen.sim.html import page_head, page_style, prose, render
+from physgen.sim.html import page_head, prose, render
+from physgen.sim.page_style import page_style
 from physgen.sim.reconstruct import reconstruction_report
 
 from .browser import PROGRAM, Browser

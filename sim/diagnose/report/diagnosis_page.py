@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ...atomic import write_bytes
-from ...html import page_head, page_style, picture_style, prose, render, short_number, shortened
+from ...html import page_head, prose, render, short_number, shortened
+from ...page_style import page_style, picture_style
 from ...version import VERSION
 from ..capture import Capture
 from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
