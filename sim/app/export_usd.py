@@ -11,7 +11,6 @@ import contextlib
 import math
 import unicodedata
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file, shown
 from ..memory import ran_out
-from ..mpm.geometry.mass_properties import mesh_properties
 from ..mpm.surface_contact import SurfaceContact
 from ..rigid_alignment import nearest_pose
 from ..scene.folder import SCENE_FILE, Scene, unchanged_scene
@@ -35,6 +33,7 @@ from ..scene.scene_object import SceneObject
 from ..scene.shading import evenly_lit_mesh
 from ..scene.textured_mesh import TexturedMesh
 from .export_patch import prim_name
+from .scene_bodies import mass_of
 from .scene_contacts import surface
 from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
 
@@ -45,31 +44,6 @@ RIGID_FIT = 1e-4
 FOCAL_LENGTH = 35.0
 """Of the camera, tenths of a unit: only its ratio to the aperture counts."""
 PICTURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Mass:
-    """mass kg; centre (3,) m, world; inertia (3,) kg m² about ``axes`` (3, 3), columns, right-handed."""
-
-    mass: float
-    centre: Array
-    inertia: Array
-    axes: Array
-
-
-def mass_of(item: SceneObject, vertices: Array, faces: NDArray[np.int64], *, thickness: float | None = None) -> Mass:
-    """Return the mass of the object with ``vertices`` (V, 3), world m: of the solid that its mesh encloses.
-
-    thickness: of the wall of a hollow one, m, which then counts as a thin shell. Raises InputError where the mesh
-    encloses nothing.
-    """
-    try:
-        found = mesh_properties(vertices, faces, density=item.material.density, thickness=thickness)
-    except InputError as error:
-        raise InputError(f"object {item.name}: {error}") from None
-    inertia, axes = np.linalg.eigh(found.inertia)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    return Mass(mass=found.mass, centre=found.center, inertia=inertia, axes=axes)
 
 
 def export_usd(

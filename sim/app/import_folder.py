@@ -28,7 +28,7 @@ from ..scene.folder import Scene, load_scene, save_scene
 from ..scene.material import load_preset
 from ..scene.model import Ground, SceneModel
 from ..scene.scene_object import SceneObject
-from .export_usd import mass_of
+from .scene_bodies import mass_of
 
 
 def mask_requests(

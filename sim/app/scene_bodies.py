@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies and colliders of the engine from the objects of a scene and their meshes. No Taichi.
+"""Bodies and colliders of the engine, and masses, from the objects of a scene and their meshes. No Taichi.
 
 Materials become the engine's. Of the particles that fill a mesh, a hollow body has those near its surface.
 """
@@ -7,6 +7,7 @@ Materials become the engine's. Of the particles that fill a mesh, a hollow body 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..mpm.bodies import BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES, InteriorSample, sample_interior
+from ..mpm.geometry.mass_properties import mesh_properties
 from ..scene.folder import Scene
 from ..scene.meshes import MAX_TRACK_BYTES, ObjectMesh, load_vertex_track
 from ..scene.model import Keys, Material, Motion, SceneModel, SceneObject
@@ -219,3 +221,34 @@ def track_of(keys: Keys) -> Track | None:
     if not keys:
         return None
     return Track(times=np.array([key.time_s for key in keys]), values=np.array([key.value for key in keys]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mass:
+    """mass kg; centre (3,) m, world; inertia (3,) kg m² about ``axes`` (3, 3), columns, right-handed."""
+
+    mass: float
+    centre: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+
+def mass_of(
+    item: SceneObject,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    *,
+    thickness: float | None = None,
+) -> Mass:
+    """Return the mass of the object with ``vertices`` (V, 3), world m: of the solid that its mesh encloses.
+
+    thickness: of the wall of a hollow one, m, which then counts as a thin shell. Raises InputError where the mesh
+    encloses nothing.
+    """
+    try:
+        found = mesh_properties(vertices, faces, density=item.material.density, thickness=thickness)
+    except InputError as error:
+        raise InputError(f"object {item.name}: {error}") from None
+    inertia, axes = np.linalg.eigh(found.inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return Mass(mass=found.mass, centre=found.center, inertia=inertia, axes=axes)

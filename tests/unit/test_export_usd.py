@@ -12,7 +12,7 @@ import physgen
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.app.export_usd import mass_of
+from physgen.sim.app.scene_bodies import mass_of
 from physgen.sim.app.usd_particles import mpm_material, prepared_particles
 from physgen.sim.cache.bake_folder import Bake, BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer

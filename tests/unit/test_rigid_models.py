@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.app.export_usd import mass_of
 from physgen.sim.app.import_folder import import_folder
+from physgen.sim.app.scene_bodies import mass_of
 from physgen.sim.errors import InputError
 from physgen.sim.importers.rigid_models import read_rigid_model
 from physgen.sim.scene.folder import load_scene
