@@ -336,19 +336,11 @@ def compose(
     open surfaces; SimulationError when the run fails; Cancelled.
     """
     options, solver = options or ComposeOptions(), solver or SolverOptions()
-    if len(parts) < 2:
-        raise InputError(f"composition: {len(parts)} object given: choose at least two")
-    if options.uses_images and reference is None and not guidance:
-        raise InputError(
-            f"compose option method is {options.method!r} without a picture: give a reference, or use 'ppps'"
-        )
+    _check_given(parts, reference, guidance, options)
     if reference is not None:
         reference = scaled_reference(reference, options.size)
     rasteriser = Rasteriser(solver=solver)
     watched = {name: CheckedGuidance(given) for name, given in guidance.items()}
-    strange = sorted(set(watched) - {part.name for part in parts[1:]})
-    if strange:
-        raise InputError(f"guidance is given for {strange[0]!r}: no deformable object has that name")
     fixed: list[CompositionPart] = [parts[0]]
     lattices: list[DistanceLattice] = []
     history: list[StepRecord] = []
@@ -364,16 +356,8 @@ def compose(
             cameras=cameras or orbit_cameras(part.splats.centres, options.size),
             options=options,
         )
-        boundaries = [Collider(name=f"{other.name} (fixed)", surface=other.surface) for other in fixed]
         lattices.append(part_distances(fixed[-1]))
-        body = DeformablePart(
-            part,
-            boundaries,
-            StepOptions(
-                substeps=options.substeps, cells_across=options.cells, keep_strain=options.keep_strain, solver=solver
-            ),
-            seed=options.seed,
-        )
+        body = _deformable(part, fixed, options, solver)
         optimiser = PartOptimiser(splats=part.splats, body=body, options=options)
         for step in optimiser.steps(objective.evaluate):
             if cancelled():
@@ -395,6 +379,35 @@ def compose(
     seats = options.simulates and options.seat > 0
     placed = seated_parts(fixed, options.seat, ground) if seats else tuple(fixed)
     return Composition(parts=placed, history=tuple(history), notes=notes)
+
+
+def _check_given(
+    parts: Sequence[CompositionPart],
+    reference: Reference | None,
+    guidance: Mapping[str, Guidance],
+    options: ComposeOptions,
+) -> None:
+    """Raise InputError where ``compose`` says so, apart from surfaces."""
+    if len(parts) < 2:
+        raise InputError(f"composition: {len(parts)} object given: choose at least two")
+    if options.uses_images and reference is None and not guidance:
+        raise InputError(
+            f"compose option method is {options.method!r} without a picture: give a reference, or use 'ppps'"
+        )
+    strange = sorted(set(guidance) - {part.name for part in parts[1:]})
+    if strange:
+        raise InputError(f"guidance is given for {strange[0]!r}: no deformable object has that name")
+
+
+def _deformable(
+    part: CompositionPart, fixed: Sequence[CompositionPart], options: ComposeOptions, solver: SolverOptions
+) -> DeformablePart:
+    """Return ``part`` as a body that deforms among those ``fixed``."""
+    boundaries = [Collider(name=f"{other.name} (fixed)", surface=other.surface) for other in fixed]
+    steps = StepOptions(
+        substeps=options.substeps, cells_across=options.cells, keep_strain=options.keep_strain, solver=solver
+    )
+    return DeformablePart(part, boundaries, steps, seed=options.seed)
 
 
 def scaled_reference(reference: Reference, size: int) -> Reference:
