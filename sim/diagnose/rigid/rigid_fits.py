@@ -47,6 +47,7 @@ from .rigid_prediction import (
     simulate_points,
     step_size_error,
 )
+from .rigid_refits import refine_promising, refit_beliefs, refit_best, settle_on_a_face, sharpen
 from .rigid_search import (
     BodyFits,
     begin_search,
@@ -55,11 +56,6 @@ from .rigid_search import (
     fit_camera_pose,
     fit_nominal,
     reconsider_nominal,
-    refine_promising,
-    refit_beliefs,
-    refit_best,
-    settle_on_a_face,
-    sharpen,
 )
 from .shared_spins import share_spins
 
