@@ -8,7 +8,8 @@ import pytest
 from physgen.sim.errors import InputError
 from physgen.sim.gaussians.views.hull_segmentation import VoteOptions, vote_labels
 from physgen.sim.gaussians.views.posed_images import View, orbit_camera
-from physgen.sim.gaussians.views.visual_hull import HullOptions, depth_buffer, visual_hull
+from physgen.sim.gaussians.views.silhouettes import depth_buffer
+from physgen.sim.gaussians.views.visual_hull import HullOptions, visual_hull
 from physgen.sim.mpm.geometry.triangles import check_closed, signed_volume
 
 from .splat_scenes import Ball, Box, Ring, views_of

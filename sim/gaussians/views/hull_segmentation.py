@@ -22,7 +22,7 @@ from ...mpm.colliders import Surface
 from ...mpm.geometry.signed_distance import DistanceLattice, signed_distance
 from ...mpm.geometry.triangles import area_normals
 from .posed_images import FOREGROUND, Labels, View
-from .visual_hull import VoxelGrid, depth_buffer
+from .silhouettes import VoxelGrid, depth_buffer
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
