@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from physgen.benchmarks.common import benchmark_parser, print_result
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.shape.object_bodies import build_body
+from physgen.sim.reconstruct.shape.built_body import build_body
 from physgen.sim.scene.model import Camera
 from PIL import Image
 

@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.shape import inflated_mesh as meshes
+from physgen.sim.reconstruct.shape.built_body import silhouette_overlap
 from physgen.sim.reconstruct.shape.floor_limbs import with_limbs
 from physgen.sim.reconstruct.shape.inflate import inflate
-from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
 from physgen.sim.reconstruct.shape.reference_surfaces import reference_surfaces
 
 WIDTH, HEIGHT = 320, 240

@@ -15,7 +15,7 @@ from physgen.sim.mpm.colliders import Surface
 from physgen.sim.mpm.geometry.mesh_checks import check_surface
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
-from physgen.sim.reconstruct.shape.object_bodies import build_body
+from physgen.sim.reconstruct.shape.built_body import build_body
 from physgen.sim.reconstruct.shape.primitive_mesh import cube_surface
 from physgen.sim.reconstruct.shape.primitives import Box, Sphere, SurfaceOfRevolution, rasterize
 from physgen.sim.reconstruct.shape.surface_mesh import keep_main_part

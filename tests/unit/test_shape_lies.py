@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+from physgen.sim.reconstruct.shape.built_body import build_body
 from physgen.sim.reconstruct.shape.inflate import inflate
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
-from physgen.sim.reconstruct.shape.object_bodies import build_body
 
 WIDTH, HEIGHT = 320, 240
 VIEW = camera_above_ground(WIDTH, HEIGHT, 400.0, math.radians(24.0))

@@ -14,10 +14,10 @@ from physgen.sim.errors import InputError
 from physgen.sim.reconstruct.camera.depth_map import DepthMap
 from physgen.sim.reconstruct.camera.ground_camera import ground_depth
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
+from physgen.sim.reconstruct.shape.built_body import build_body
 from physgen.sim.reconstruct.shape.furniture import furniture_legs
 from physgen.sim.reconstruct.shape.inflate import crop_mask
 from physgen.sim.reconstruct.shape.legs import find_legs
-from physgen.sim.reconstruct.shape.object_bodies import build_body
 from physgen.sim.reconstruct.shape.stability import support_of
 from scipy import ndimage
 

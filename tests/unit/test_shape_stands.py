@@ -8,9 +8,9 @@ import trimesh
 from physgen.sim.mpm.geometry.triangles import area_normals
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.shape import inflated_mesh as meshes
+from physgen.sim.reconstruct.shape.built_body import silhouette_overlap
 from physgen.sim.reconstruct.shape.inflate import inflate
 from physgen.sim.reconstruct.shape.inflated_mesh import inflated_mesh
-from physgen.sim.reconstruct.shape.object_bodies import silhouette_overlap
 from physgen.sim.reconstruct.shape.primitive_mesh import primitive_mesh
 from physgen.sim.reconstruct.shape.primitives import Box
 from physgen.sim.reconstruct.shape.stability import footed, support_of

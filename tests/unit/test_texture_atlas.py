@@ -13,8 +13,8 @@ from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.mesh_raster import rasterise
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, ReconstructOptions
 from physgen.sim.reconstruct.shape.body_texture import crop_texture, glb_bytes, seen_vertices, textured
+from physgen.sim.reconstruct.shape.built_body import build_body
 from physgen.sim.reconstruct.shape.even_light import light_on
-from physgen.sim.reconstruct.shape.object_bodies import build_body
 from physgen.sim.reconstruct.shape.plain_matter import plain_matter, synthesised_grain
 from physgen.sim.reconstruct.shape.texture_atlas import textured_body
 from physgen.sim.scene.shading import NEUTRAL, evenly_lit

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From a mask to a closed body that stands on the ground, textured by the photo.
 
-object_bodies.py       a body for each object, in order
+object_bodies.py       a body for each object, in order; built_body.py makes one from its outline
 primitives.py          boxes, spheres, surfaces of revolution; primitive_fit.py fits one to an outline,
                        primitive_choice.py decides which, primitive_mesh.py makes its mesh, flat_disc.py finds coins
 inflate.py             thickness of a silhouette; inflated_mesh.py its mesh
