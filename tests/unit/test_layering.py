@@ -129,7 +129,7 @@ def test_every_preset_says_where_its_numbers_come_from():
 LISTED = re.compile(r"\b(\w+)\.py\b")
 
 
-@pytest.mark.parametrize("folder", ["sim/app", "sim/reconstruct/shape", "physgen_addon/render"])
+@pytest.mark.parametrize("folder", ["sim/app", "sim/reconstruct/shape", "sim/diagnose/rigid", "physgen_addon/render"])
 def test_a_large_folder_lists_its_files(folder):
     text = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
     assert set(LISTED.findall(text)) == {path.stem for path in sources(folder)} - {"__init__"}
