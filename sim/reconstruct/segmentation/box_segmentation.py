@@ -29,6 +29,7 @@ from .mask_proposals import ground_like, proposals, refine, score, without_notch
 from .mirrored_outline import mirrored_outline
 from .outer_rim import outer_rim
 from .plain_backdrop import missing_parts, on_blank_page, plain_backdrop
+from .reflected_colour import tinted_ground
 from .strokes import Strokes, no_strokes
 
 COARSE_SIZE = 280
@@ -39,6 +40,8 @@ PADDING = 0.35
 """Margin of background to learn from, over the box' longer side."""
 FAINT = 0.4
 """Gradient across an outline, in CIELAB units per pixel, below which there is none."""
+SAME = 0.9
+"""Share of a mask without shade that the next proposal must keep: it is to lose what else is ground, not the object."""
 MIN_AREA = 64
 """Smallest area of a mask in pixels."""
 
@@ -76,11 +79,12 @@ class _Surroundings:
 
 @dataclass(frozen=True)
 class _Coarse:
-    """mask: (h, w) the best proposal. closed: (h, w) its parts that only contours speak for. notices: about it. sides:
-    of the box, that may cut it."""
+    """mask: (h, w) the best proposal. closed: (h, w) its parts that only contours speak for. tint: (h, w) ground that
+    shows its colour. notices: about it. sides: of the box, that may cut it."""
 
     mask: Mask
     closed: Mask
+    tint: Mask
     notices: Sequence[str] = ()
     sides: Sequence[str] = ()
 
@@ -126,6 +130,8 @@ def segment(
     coarse = _coarse(near, iterations)
     # A part that only contours speak for is as certain as a stroke: colours would drop it again.
     near = replace(near, keep=near.keep | (coarse.closed & ~near.drop & ~near.taken))
+    # Neither the object nor what its background is known by.
+    near = replace(near, taken=near.taken | (coarse.tint & ~near.keep))
     notices, sides = coarse.notices, coarse.sides
     gaps: Mask | None = np.zeros_like(near.taken)
     if not near.keep.any() and coarse.mask.sum() < max(MIN_AREA, 0.01 * (x1 - x0) * (y1 - y0)):
@@ -185,10 +191,15 @@ def _outlined(pixels: NDArray[np.uint8], box: Box, near: _Surroundings, coarse: 
         found = _fine(near, found)
     gaps, rods = _details(near, found)
     found = (found & ~gaps) | rods
-    found = settle_outline(crop, drop_ground_shadow(crop, near.kept_part(found & ~taken)))
+    # Thin parts are known to be no shadows, and have no middle whose colour would tell their outline.
+    found = near.kept_part(found & ~taken)
+    found = settle_outline(crop, drop_ground_shadow(crop, found)) | (rods & found)
     mirrored = mirrored_outline(crop, near.box, found, taken, drop)
     if (mirrored != found).any():
-        found = settle_outline(crop, mirrored)
+        # The outline of a handle goes around what shows through it.
+        through = mirrored & ~open_holes(crop, mirrored, within=shrunk(mirrored & ~found, 3))
+        gaps |= through
+        found = settle_outline(crop, mirrored & ~through)
     rim = outer_rim(crop, found, taken | drop)
     if rim.any():
         found = settle_outline(crop, found | rim)
@@ -251,7 +262,8 @@ def check_distinct(masks: Sequence[Mask], names: Sequence[str]) -> None:
 
 def _coarse(near: _Surroundings, iterations: int) -> _Coarse:
     """The best proposal, found on a small copy; empty where colours show no outline."""
-    nothing = _Coarse(np.zeros_like(near.taken), np.zeros_like(near.taken))
+    empty = np.zeros_like(near.taken)
+    nothing = _Coarse(empty, empty, empty)
     copy = small_copy(near.taken.shape, COARSE_SIZE)
     closed = copy.mask(near.taken)
     # A stroke is thinner than a pixel of the copy: keep every pixel that it touches, unless both do.
@@ -269,11 +281,16 @@ def _coarse(near: _Surroundings, iterations: int) -> _Coarse:
     if outline_strength(view, chosen) < FAINT and not view.keep.any():
         return nothing
     chosen = _without_images(view, chosen, _without_shade(view, chosen, iterations))
+    tint = tinted_ground(view, chosen)
+    if tint.any():
+        view = replace(view, others=view.others | tint)
+        chosen = _kept_part(chosen & ~tint, view.others, view.keep)
     completed = completed_by_contours(view, chosen, shade=_shade(view, chosen))
     notices = [*mask_warnings(view, raw, chosen), *_doubts(completed)]
     return _Coarse(
         copy.enlarged(completed.mask),
         copy.enlarged(shrunk(completed.added)),
+        copy.enlarged(tint),
         notices,
         continued_sides(view, completed.mask),
     )
@@ -288,7 +305,7 @@ def _without_shade(view: BoxCrop, chosen: Mask, iterations: int) -> Mask:
     told = replace(view, drop=view.drop | (chosen & ~rest))
     again = _best_proposal(told, iterations)[1]
     again = _kept_part(without_ground(told, again) & grown(rest), view.others, view.keep)
-    return again if again.sum() > 0.5 * rest.sum() else rest
+    return again if again.sum() > SAME * rest.sum() else rest
 
 
 def _doubts(completed: Completed) -> list[str]:

@@ -33,6 +33,8 @@ LEG, UPRIGHT = 0.12, 1.8
 """Largest width of a leg over the object's size, and least height over its width."""
 SHORT = 0.06
 """Least length of a rod or leg over the object's size."""
+HANDLE = 0.25
+"""Least length of a handle, a rod that is joined at two places, over the object's size."""
 SEAM = 4
 """Pixels between a leg and what it carries, whose colours are mixed."""
 UNKNOWN = 3.0
@@ -77,12 +79,13 @@ def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None
     seen = _likeness(view, mask)
     if seen is None:
         return nothing, nothing
-    gaps, rods, legs = _gaps(seen), _rods(seen), _legs(seen)
+    strange = _strange_cut(seen)
+    gaps, rods, handles, legs = _gaps(seen), _rods(seen), _handles(seen, strange), _legs(seen, strange)
     if shade is not None:
         rods = [part for part in rods if shade()[part].mean() <= SHADE_SHARE]
         # Where a leg's colours and the ground's are mixed, they look like shade.
         legs = [part for part in legs if shade()[_core(part)].mean() < SHADE_SHARE]
-    thin = np.logical_or.reduce([nothing, *rods, *legs])
+    thin = np.logical_or.reduce([nothing, *rods, *handles, *legs])
     if gaps.sum() > 0.8 * mask.sum():
         return nothing, thin
     # What only a gap's edge held in place goes with it.
@@ -139,32 +142,56 @@ def _gaps(seen: _Likeness) -> Mask:
     return _between_slats(mask, candidates, seen.size)
 
 
+def _strange_cut(seen: _Likeness) -> Mask:
+    """A cut (h, w) in which every colour is as likely as one that the object has nowhere else: chairs of cloth have
+    legs of wood, clocks handles of steel."""
+    window = seen.view.inside | seen.mask
+    ratio = np.where(window, np.clip((seen.usual - UNKNOWN) - seen.ground, -4.0, 4.0), 0.0).astype(np.float32)
+    return graph_cut(ratio, principal_contrast(seen.view.lab), 1.0, barred=~window)
+
+
 def _rods(seen: _Likeness) -> list[Mask]:
     """Thin parts (h, w) of the cut beside the mask, unlike the ground, on edges, that touch it."""
+    thin = [part for part, _ in _thin_parts(seen, seen.cut)]
+    return [part for part in thin if (seen.ratio[part] > 1.0).mean() >= 0.6]
+
+
+def _handles(seen: _Likeness, strange: Mask) -> list[Mask]:
+    """Thin parts (h, w) beside the mask, on edges, that touch it at both ends, of any colour: no crease or shadow of
+    the ground begins and ends at the object."""
     result = []
-    for part, box in _parts(seen.cut & ~seen.mask & seen.view.inside, 16):
+    for cut in (seen.cut & (seen.ratio > 0.0), strange):
+        for part, joined in _thin_parts(seen, cut):
+            _, _, width, height = cv2.boundingRect(part.astype(np.uint8))
+            if _joints(joined) > 1 and float(np.hypot(width, height)) > HANDLE * seen.size:
+                # With the mixed pixels between both.
+                result.append(part | (grown(part, 2) & grown(joined, 2)))
+    return result
+
+
+def _thin_parts(seen: _Likeness, cut: Mask) -> list[tuple[Mask, Mask]]:
+    """Thin parts (h, w) of ``cut`` (h, w) beside the mask, on edges; and the pixels of the mask that each touches."""
+    result = []
+    for part, box in _parts(cut & ~seen.mask & seen.view.inside, 16):
         if _width(part) > THIN * seen.size + 3.0 or float(np.hypot(box[2], box[3])) < SHORT * seen.size:
             continue
         contour = ring_around(part, 1) & ~seen.mask
         joined = grown(part, 2) & seen.mask
-        if not joined.any() or not contour.any() or seen.on_edges(contour) < ON_EDGES:
-            continue
-        if (seen.ratio[part] > 1.0).mean() >= 0.6:
-            result.append(part)
+        if joined.any() and contour.any() and seen.on_edges(contour) >= ON_EDGES:
+            result.append((part, joined))
     return result
 
 
-def _legs(seen: _Likeness) -> list[Mask]:
-    """Parts (h, w) below the object that carry it: thin, upright, on edges, of any colour but the ground's.
+def _joints(joined: Mask) -> int:
+    """The number of places (h, w) where a part touches the mask."""
+    return int(cv2.connectedComponents(joined.astype(np.uint8), connectivity=8)[0]) - 1
 
-    Chairs of cloth have legs of wood, so the cut is made anew with every colour as likely as one that the object has
-    nowhere else.
-    """
+
+def _legs(seen: _Likeness, strange: Mask) -> list[Mask]:
+    """Parts (h, w) of the cut ``strange`` (h, w) below the object that carry it: thin, upright, on edges, of any colour
+    but the ground's."""
     view, mask = seen.view, seen.mask
-    window = view.inside | mask
-    ratio = np.where(window, np.clip((seen.usual - UNKNOWN) - seen.ground, -4.0, 4.0), 0.0).astype(np.float32)
-    cut = graph_cut(ratio, principal_contrast(view.lab), 1.0, barred=~window)
-    free = cut & view.inside & ~ring_around(mask, 1) & ~mask
+    free = strange & view.inside & ~ring_around(mask, 1) & ~mask
     result = []
     for part, (_, top, _, height) in _parts(free, 16):
         width = _width(part)

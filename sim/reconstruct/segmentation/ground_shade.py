@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .box_crop import EDGE, BoxCrop, edge_crest, edge_strength
 from .colour_models import OBJECT_PARTS, SMOOTHNESS, graph_cut, learn, principal_contrast
-from .mask_geometry import Mask, grown, hull_of, largest_component
+from .mask_geometry import Mask, grown, hull_of, largest_component, shrunk
 
 Light = NDArray[np.float32]
 
@@ -56,6 +56,10 @@ ROUGHER, SMOOTH, DARK_SHARE = 3.5, 0.03, 0.1
 """Fine texture, in natural logarithms of light, over the ground's above which a part is none in shade: shade keeps the
 ratios of lights, so it keeps texture. 1.8 to 2.2 was measured in shadows of two photos, 6 on granite before ice, 20 on
 a toy's wheels. Least texture of a ground; and the share of ``DARK_NOISE`` that is texture of what is nearly black."""
+LARGE, LARGE_ROUGHER = 0.25, 3.0
+"""Area of a part over the mask's from which the second holds in place of ``ROUGHER`` within it: 1.2 was measured in the
+shadow of a shoe on grass, 2.5 in a plush's on wood, 3.5 on the shaded panels, grilles and tyres of a car.
+"""
 BESIDE = 2.0
 """Standard deviation in pixels over which the light on both sides of an outline is averaged."""
 BRIGHTER, MOST_BRIGHTER = 0.25, 0.15
@@ -98,7 +102,7 @@ def shaded_ground(view: BoxCrop, mask: Mask) -> Mask:
     return np.asarray((unlike < LIKE) & (brighter < SHADED))
 
 
-def _log_light(pixels: NDArray[np.uint8]) -> Light:
+def log_light(pixels: NDArray[np.uint8]) -> Light:
     """Natural logarithm (h, w, 3) of linear light, slightly smoothed."""
     smooth = cv2.GaussianBlur(pixels.astype(np.float32) / 255.0, (0, 0), 0.8)
     linear = np.where(smooth <= 0.04045, smooth / 12.92, ((smooth + 0.055) / 1.055) ** 2.4)
@@ -109,10 +113,10 @@ def _unlike_ground(view: BoxCrop, mask: Mask, *, polished: bool = False) -> tupl
     """Return how unlike the ground each pixel (h, w) is, lit or shaded: squared distance from the line in standard
     deviations; and how much brighter than the ground around it, as a natural logarithm. polished: also under mirror
     images, where the ground beside ``mask`` shows some, too."""
-    light = _log_light(view.pixels)
+    light = log_light(view.pixels)
     size = float(np.sqrt(mask.sum()))
     free = ~grown(mask, 2) & ~view.others
-    ground = _lit_ground(light, free, LOCAL * size)
+    ground = lit_ground(light, free, LOCAL * size)
     reach = max(2, round(0.2 * size))
     near = grown(mask, reach) & free
     # Along the line all channels change at these rates, whose mean is 1.
@@ -144,7 +148,7 @@ def _from_line(light: Light, ground: Light, rates: NDArray[np.floating]) -> tupl
     return np.asarray(apart, dtype=np.float32), np.asarray(along, dtype=np.float32)
 
 
-def _lit_ground(light: Light, free: Mask, sigma: float) -> Light:
+def lit_ground(light: Light, free: Mask, sigma: float) -> Light:
     """Local mean (h, w, 3) of the lit ground's ``light``, from the pixels ``free`` (h, w) of objects."""
     weight = free.astype(np.float32)
     mean = light
@@ -225,19 +229,27 @@ def _texture(light: Light, where: Mask) -> Light:
 def _rougher(view: BoxCrop, mask: Mask, parts: Mask, labels: NDArray[np.int32]) -> set[int]:
     """The ``labels`` of those of ``parts`` whose fine texture is more than the ground's beside ``mask``, all (h, w)."""
     kernel = np.ones((3, 3), np.uint8)
-    light = _log_light(view.pixels)
+    light = log_light(view.pixels)
     near = grown(mask, max(2, round(0.2 * float(np.sqrt(mask.sum())))))
     free = ~grown(mask, 2) & ~view.others
     beside = cv2.erode((near & free).astype(np.uint8), kernel) > 0
     usual = max(SMOOTH, float(np.quantile(_texture(light, free)[beside], 0.75)) if beside.any() else 0.0)
     own, noise = _texture(light, parts), DARK_SHARE * DARK_NOISE / np.exp(light.mean(axis=2))
     inner = cv2.erode(parts.astype(np.uint8), kernel) > 0
-    return {
+    rougher = {
         int(index)
         for index in np.unique(labels[inner])
         if (where := inner & (labels == index)).sum() >= SPECK
         and np.quantile(own[where], 0.75) > ROUGHER * (usual + float(np.median(noise[where])))
     }
+    # Far from its rim and from black more is known of a large part.
+    lit = shrunk(parts, 3) & (noise < 0.3 * SMOOTH)
+    for index in np.unique(labels[lit]):
+        where = lit & (labels == index)
+        large = (labels == index).sum() > LARGE * mask.sum() and where.sum() >= SPECK
+        if large and np.quantile(own[where], 0.75) > LARGE_ROUGHER * usual:
+            rougher.add(int(index))
+    return rougher
 
 
 def _pieces(own: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -285,7 +297,7 @@ def _given_back(view: BoxCrop, parts: Mask, mask: Mask, own: Mask, judged: tuple
     count, labels, stats, _ = cv2.connectedComponentsWithStats(parts.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
     pieces, rougher = _pieces(own), _rougher(view, mask, parts, np.asarray(labels, dtype=np.int32))
-    light = _log_light(view.pixels).mean(axis=2)
+    light = log_light(view.pixels).mean(axis=2)
     for index in range(1, count):
         if stats[index, cv2.CC_STAT_AREA] < SPECK or index in rougher:
             continue

@@ -77,16 +77,16 @@ def is_box_with_print(mask: Mask, holes: Mask) -> bool:
     return bool((drawn & filled).sum() > BOX_OVERLAP * (drawn | filled).sum())
 
 
-def open_holes(pixels: NDArray[np.uint8], mask: Mask) -> Mask:
+def open_holes(pixels: NDArray[np.uint8], mask: Mask, *, within: Mask | None = None) -> Mask:
     """Return ``mask`` without interior regions that look like the background beside it: inside a handle, a strap.
 
     GrabCut includes them when the box holds so much background that it is learned as an object colour. pixels: (H, W,
-    3) sRGB.
+    3) sRGB. within: (H, W) where such regions are looked for, everywhere by default.
     """
     area = int(mask.sum())
     lab = cielab(np.asarray(cv2.GaussianBlur(pixels, (0, 0), 1.0), dtype=np.uint8))
     ring = surrounding_ring(mask, max(4, round(0.12 * np.sqrt(area))))
-    inner = shrunk(mask, 2)
+    inner = shrunk(mask, 2) if within is None else shrunk(mask, 2) & within
     near, inside = lab[ring], lab[inner]
     if len(near) < 50 or len(inside) < 50:
         return mask.copy()
