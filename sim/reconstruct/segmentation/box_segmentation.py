@@ -189,11 +189,10 @@ def _outlined(pixels: NDArray[np.uint8], box: Box, near: _Surroundings, coarse: 
     found = opened | touching(coarse & ~opened, keep) if keep.any() else opened
     if crop.shape[0] * crop.shape[1] <= FINE_PIXELS:
         found = _fine(near, found)
-    gaps, rods = _details(near, found)
-    found = (found & ~gaps) | rods
-    # Thin parts are known to be no shadows, and have no middle whose colour would tell their outline.
-    found = near.kept_part(found & ~taken)
-    found = settle_outline(crop, drop_ground_shadow(crop, found)) | (rods & found)
+    gaps, rods, handles = _details(near, found)
+    found = near.kept_part(((found & ~gaps) | rods | handles) & ~taken)
+    # A handle is no shadow, and has no middle whose colour would tell its outline.
+    found = settle_outline(crop, drop_ground_shadow(crop, found)) | (handles & found)
     mirrored = mirrored_outline(crop, near.box, found, taken, drop)
     if (mirrored != found).any():
         # The outline of a handle goes around what shows through it.
@@ -352,14 +351,15 @@ def _best_proposal(view: BoxCrop, iterations: int) -> tuple[Mask, Mask]:
     return raw[best], guesses[best]
 
 
-def _details(near: _Surroundings, found: Mask) -> tuple[Mask, Mask]:
-    """Gaps in ``found`` and rods beside it, both (h, w), found on a copy that shows them."""
+def _details(near: _Surroundings, found: Mask) -> tuple[Mask, Mask, Mask]:
+    """Gaps in ``found``, and rods and handles beside it, all (h, w), found on a copy that shows them."""
     copy = small_copy(found.shape, FINE)
     mask, keep = copy.mask(found), copy.share(near.keep) > 0.0
     drop = (copy.share(near.drop) > 0.0) & ~keep
     view = crop_around_box(copy.pixels(near.pixels), copy.box(near.box), copy.mask(near.taken), keep=keep, drop=drop)
-    gaps, rods = gaps_and_rods(view, mask, shade=_shade(view, mask))
-    return copy.enlarged(gaps) & ~near.keep, copy.enlarged(rods) & ~near.drop & ~near.taken
+    gaps, *beside = gaps_and_rods(view, mask, shade=_shade(view, mask))
+    rods, handles = (copy.enlarged(part) & ~near.drop & ~near.taken for part in beside)
+    return copy.enlarged(gaps) & ~near.keep, rods, handles
 
 
 def _shade(view: BoxCrop, mask: Mask) -> Callable[[], Mask] | None:

@@ -68,28 +68,28 @@ class _Likeness:
         return float((self.crest[contour] > CREST).mean())
 
 
-def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None = None) -> tuple[Mask, Mask]:
-    """Return gaps (h, w) in the filled ``mask`` through which the ground shows, and rods (h, w) beside it.
+def gaps_and_rods(view: BoxCrop, mask: Mask, *, shade: Callable[[], Mask] | None = None) -> tuple[Mask, Mask, Mask]:
+    """Return gaps (h, w) in the filled ``mask`` through which the ground shows, and rods and handles (h, w) beside it.
 
     A gap is typical ground by colour, texture and place, long, and surrounded by edges; a rod is unlike the ground, lit
-    or shaded, thin, on edges, and joined to the object. shade: returns (h, w) pixels of which no rod consists, as they
-    look like shaded ground; asked once a candidate is left.
+    or shaded, thin, on edges, and joined to the object; a handle is joined to it at both ends. shade: returns (h, w)
+    pixels of which no rod consists, as they look like shaded ground; asked once a candidate is left.
     """
     nothing = np.zeros_like(mask)
     seen = _likeness(view, mask)
     if seen is None:
-        return nothing, nothing
+        return nothing, nothing, nothing
     strange = _strange_cut(seen)
     gaps, rods, handles, legs = _gaps(seen), _rods(seen), _handles(seen, strange), _legs(seen, strange)
     if shade is not None:
         rods = [part for part in rods if shade()[part].mean() <= SHADE_SHARE]
         # Where a leg's colours and the ground's are mixed, they look like shade.
         legs = [part for part in legs if shade()[_core(part)].mean() < SHADE_SHARE]
-    thin = np.logical_or.reduce([nothing, *rods, *handles, *legs])
+    thin, held = (np.logical_or.reduce([nothing, *parts]) for parts in ((*rods, *legs), handles))
     if gaps.sum() > 0.8 * mask.sum():
-        return nothing, thin
+        return nothing, thin, held
     # What only a gap's edge held in place goes with it.
-    return gaps, thin & touching(thin | (mask & ~gaps), mask & ~gaps)
+    return gaps, thin & touching(thin | held | (mask & ~gaps), mask & ~gaps), held
 
 
 def _likeness(view: BoxCrop, mask: Mask) -> _Likeness | None:
