@@ -33,8 +33,9 @@ LEG, UPRIGHT = 0.12, 1.8
 """Largest width of a leg over the object's size, and least height over its width."""
 SHORT = 0.06
 """Least length of a rod or leg over the object's size."""
-HANDLE = 0.25
-"""Least length of a handle, a rod that is joined at two places, over the object's size."""
+HANDLE, FEET = 0.25, 0.4
+"""Least length of a handle, a rod that is joined at two places, over the object's size; and share of the object's
+height from its foot in which there is none: a leg's shadow ends at another leg."""
 SEAM = 4
 """Pixels between a leg and what it carries, whose colours are mixed."""
 UNKNOWN = 3.0
@@ -158,12 +159,15 @@ def _rods(seen: _Likeness) -> list[Mask]:
 
 def _handles(seen: _Likeness, strange: Mask) -> list[Mask]:
     """Thin parts (h, w) beside the mask, on edges, that touch it at both ends, of any colour: no crease or shadow of
-    the ground begins and ends at the object."""
+    the ground begins and ends at the object, but for those between its feet."""
     result = []
+    rows = np.flatnonzero(seen.mask.any(axis=1))
+    feet = rows[-1] - FEET * len(rows)
     for cut in (seen.cut & (seen.ratio > 0.0), strange):
         for part, joined in _thin_parts(seen, cut):
-            _, _, width, height = cv2.boundingRect(part.astype(np.uint8))
-            if _joints(joined) > 1 and float(np.hypot(width, height)) > HANDLE * seen.size:
+            _, top, width, height = cv2.boundingRect(part.astype(np.uint8))
+            long = float(np.hypot(width, height)) > HANDLE * seen.size
+            if long and _joints(joined) > 1 and top + 0.5 * height < feet:
                 # With the mixed pixels between both.
                 result.append(part | (grown(part, 2) & grown(joined, 2)))
     return result
