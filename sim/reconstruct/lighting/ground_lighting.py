@@ -170,9 +170,11 @@ class GroundLight:
     residual: Values
 
 
-def smooth_terms(ground: Values) -> Values:
-    """Return the quadratic terms (N, 6) of the plane's coordinates (N, 2), about their middle and over their extent."""
-    x, y = ((ground - ground.mean(axis=0)) / max(float(np.ptp(ground, axis=0).max()), 1e-12)).T
+def smooth_terms(ground: Values, extent: float | None = None) -> Values:
+    """Return the quadratic terms (N, 6) of the plane's coordinates (N, 2), about their middle and over ``extent``, by
+    default theirs."""
+    over = float(np.ptp(ground, axis=0).max()) if extent is None else extent
+    x, y = ((ground - ground.mean(axis=0)) / max(over, 1e-12)).T
     return np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
 
 

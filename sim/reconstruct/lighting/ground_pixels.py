@@ -21,6 +21,7 @@ from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
 from ..shape.inflate import roundness
+from .shadow_planes import ShadowPlane, ground_plane
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -135,7 +136,8 @@ class GroundPixels:
 
     rows, columns: (N,) of the pixels. places: (N, 2) on the plane z = 0. colour: (N, 3) natural logarithm of the linear
     light. weight: (N,) confidence that they are the ground on which the objects stand. known: (h, w) 1 on these pixels.
-    object_side: pixels of the largest object.
+    object_side: pixels of the largest object. extent: of the ground near the objects, with what a wall takes of it, or
+    None for that of ``places``.
     """
 
     rows: NDArray[np.int64]
@@ -145,6 +147,7 @@ class GroundPixels:
     weight: Values
     known: NDArray[np.float32]
     object_side: float
+    extent: float | None = None
     _weights: dict[float, NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def picture(self, values: NDArray[np.generic], elsewhere: float = 0.0) -> NDArray[np.float32]:
@@ -177,29 +180,33 @@ def ground_pixels(
     camera: Camera,
     bodies: Sequence[ProxyBody],
     stay: Mask | None = None,
+    plane: ShadowPlane | None = None,
 ) -> GroundPixels | None:
     """Return the ground around ``bodies`` in ``pixels`` (H, W, 3) sRGB, or None if none is in view.
 
     masks: (H, W) of all objects; stay: (H, W) things that are no objects. Both, and the pixels along their outlines,
-    are excluded.
+    are excluded. plane: what takes the place of the ground z = 0 of ``camera``, with ``bodies`` in its frame.
     """
     height, width = pixels.shape[:2]
     sides = [max(int(np.ptp(i)) + 1 for i in np.nonzero(mask)) for mask in masks if mask.any()]
     shrink = min(1.0, max(OBJECT_SIDE / max(sides), min(SMALLEST_SIDE / min(sides), 1.0)))
     coarse = _centres(width, height, (max(1, width // 8), max(1, height // 8)))
-    area = float(_near(on_ground(camera, coarse), bodies).mean()) * width * height
+    plane = plane or ground_plane((height, width))
+    area = float(_near(plane.places(camera, coarse), bodies).mean()) * width * height
     shrink = min(shrink, math.sqrt(MOST_PIXELS / max(area, 1.0)))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     # Pixels along an outline mix object and ground: exclude them from the mean.
     seam = max(1, round(0.5 / shrink))
-    covered = np.logical_or.reduce(masks if stay is None else [*masks, stay]).astype(np.uint8)
-    open_ground = (cv2.dilate(covered, np.ones((2 * seam + 1,) * 2, np.uint8)) == 0).astype(np.float32)
+    covered = np.logical_or.reduce([*masks, ~plane.region] if stay is None else [*masks, ~plane.region, stay])
+    open_ground = (cv2.dilate(covered.astype(np.uint8), np.ones((2 * seam + 1,) * 2, np.uint8)) == 0).astype(np.float32)
     share = cv2.resize(open_ground, size, interpolation=cv2.INTER_AREA)
     light = cv2.resize(bytes_to_linear(pixels) * open_ground[..., None], size, interpolation=cv2.INTER_AREA)
-    places = on_ground(camera, _centres(width, height, size))
+    places = plane.places(camera, _centres(width, height, size))
     use = _near(places, bodies) & (share > 0.3)
     if not use.any():
         return None
+    # On less ground a smooth field would bend more, and pass soft shadows off as its own.
+    extent = None if plane.region.all() else float(np.ptp(places[_near(places, bodies)][:, :2], axis=0).max())
     linear = light[use] / share[use][:, None]
     rows, columns = np.nonzero(use)
     return GroundPixels(
@@ -210,6 +217,7 @@ def ground_pixels(
         weight=1.0 / (1.0 + (_distance(places[use], bodies) / USUAL) ** 2),
         known=use.astype(np.float32),
         object_side=max(sides) * shrink,
+        extent=extent,
     )
 
 

@@ -77,7 +77,7 @@ class ShadowLight:
 
 def fit_light(ground: GroundPixels, bodies: Sequence[ProxyBody]) -> ShadowLight:
     """Return the light under which ``bodies`` explain the colours of ``ground`` best."""
-    search = _Search(ground, bodies)
+    search = _Search(ground, bodies, _all_over())
     best = search.greedy()
     # Again, with the texture that the ground has without these shadows.
     search.learn(search.kept(best))
@@ -93,6 +93,21 @@ def fit_light(ground: GroundPixels, bodies: Sequence[ProxyBody]) -> ShadowLight:
     return best
 
 
+def fit_wall_light(wall: GroundPixels, bodies: Sequence[ProxyBody], lamps: Sequence[ShadowLamp] | None) -> ShadowLight:
+    """Return the light under which ``bodies`` explain the colours of ``wall`` best, all in its frame, whose second axis
+    points up.
+
+    lamps: those of the ground's that shine on the wall, too; None if none was found on the ground: then any that does
+    not shine from below.
+    """
+    search = _Search(wall, bodies, [slide for slide in _all_over() if slide[1] >= 0.0])
+    near = None if lamps is None else [lamp.slide for lamp in lamps]
+    best = search.greedy(near)
+    search.learn(search.kept(best))
+    best = search.greedy(near)
+    return search.soft() if best.lamps and best.gain <= 0.0 else best
+
+
 def _gain_of_first(light: ShadowLight) -> float:
     return light.gain - (SUN_GAIN if light.lamps else 0.0)
 
@@ -104,18 +119,18 @@ def _gain(light: ShadowLight) -> float:
 class _Search:
     """Trials of lamps on a sample of the ground."""
 
-    def __init__(self, ground: GroundPixels, bodies: Sequence[ProxyBody]) -> None:
+    def __init__(self, ground: GroundPixels, bodies: Sequence[ProxyBody], starts: Sequence[Values]) -> None:
         count = len(ground.rows)
         chosen = np.arange(count)
         if count > SEARCHED:
             near = ground.weight / ground.weight.sum()
             chosen = np.random.default_rng(0).choice(count, SEARCHED, replace=False, p=near)
-        self._terms, self._colour = smooth_terms(ground.places)[chosen], ground.colour[chosen]
+        self._terms, self._colour = smooth_terms(ground.places, ground.extent)[chosen], ground.colour[chosen]
         middle = np.broadcast_to(np.median(self._colour, axis=0), ground.colour.shape)
         self._fineness = pixel_noise(ground, relative_colour(ground.colour, middle))
         self._caster = ShadowCaster([body.points[::2] for body in bodies], ground.places[chosen])
         self._hidden = 1.0 - self._caster.reaching(*overcast_sky(SKY))
-        self._starts = _all_over()
+        self._starts = starts
         # The search comes by the same lamps again, once more for every texture that it learns.
         self._skies: dict[float, Values] = {}
         self._reached: dict[tuple[bytes, float, int], Values] = {}
@@ -170,18 +185,21 @@ class _Search:
         """The best light without a lamp."""
         return max((ShadowLight((), k, self.gain(1.0 - k * self._hidden)) for k in LOSSES), key=_gain)
 
-    def greedy(self) -> ShadowLight:
-        """The best light, lamp by lamp."""
-        best = max((self.soft(), self.with_another(())), key=_gain_of_first)
+    def greedy(self, near: Sequence[Values] | None = None) -> ShadowLight:
+        """The best light, lamp by lamp; lamps only ``near`` these slides (2,) if they are given."""
+        if near is not None and not len(near):
+            return self.soft()
+        first = self.with_another((), near)
+        best = max((self.soft(), first), key=_gain_of_first if near is None else _gain)
         while 0 < len(best.lamps) < MOST_LAMPS:
-            more = self.with_another(best.lamps)
+            more = self.with_another(best.lamps, near)
             if more.gain < best.gain + LAMP_GAIN:
                 break
             best = more
         return best
 
-    def with_another(self, lamps: tuple[ShadowLamp, ...]) -> ShadowLight:
-        """``lamps`` with new shares, and the lamp that explains most beside them."""
+    def with_another(self, lamps: tuple[ShadowLamp, ...], near: Sequence[Values] | None = None) -> ShadowLight:
+        """``lamps`` with new shares, and the lamp that explains most beside them, ``near`` one of these slides (2,)."""
         known = [self._reaching(lamp.slide, lamp.angle) for lamp in lamps]
 
         def tried(
@@ -198,10 +216,12 @@ class _Search:
             return max(trials, key=_gain, default=ShadowLight((*lamps, new), USUAL_LOSS, -math.inf))
 
         few, usual = SHARES[1::2], (USUAL_CHANGE,)
-        starts = zip(self._starts, self._rough, strict=True)
-        rough = [tried(slide, 0.15, reaching, shares=few, changes=usual) for slide, reaching in starts]
-        rough = sorted(rough, key=_gain, reverse=True)[:6]
-        slides = [light.lamps[-1].slide for light in rough]
+        slides = near
+        if slides is None:
+            starts = zip(self._starts, self._rough, strict=True)
+            rough = [tried(slide, 0.15, reaching, shares=few, changes=usual) for slide, reaching in starts]
+            rough = sorted(rough, key=_gain, reverse=True)[:6]
+            slides = [light.lamps[-1].slide for light in rough]
         best = max((tried(s, a, self._reaching(s, a), changes=usual) for s in slides for a in ANGLES), key=_gain)
         step = 0.12 + 0.06 * float(np.linalg.norm(best.lamps[-1].slide))
         for scale in (2.0, 1.0, 0.5):

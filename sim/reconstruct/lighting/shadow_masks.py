@@ -9,7 +9,7 @@ one ground under one light. By default a shadow is where both agree: proxy bodie
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,9 +19,10 @@ from scipy import ndimage
 from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..segmentation.mask_geometry import enclosed_holes
-from .ground_pixels import GroundPixels, ground_pixels, proxy_body
-from .shadow_lamps import fit_light, light_shares
-from .shadow_model import SHADOW_RATIO, light_level_posterior, observed_darkening, shadow_probability
+from .ground_pixels import GroundPixels, ProxyBody, ground_pixels, proxy_body
+from .shadow_lamps import ShadowLamp, ShadowLight, direction_of, fit_light, fit_wall_light, light_shares
+from .shadow_model import SHADOW_RATIO, darkening_sums, light_level_posterior, shadow_probability
+from .shadow_planes import ShadowPlane, ground_plane, wall_behind
 
 Mask = NDArray[np.bool_]
 
@@ -163,6 +164,10 @@ does not."""
 DARKENED = 0.3
 """Share of the darkening along its border that the photo must show of a shadow, else it is another surface. True ones
 in 15 photos and rendered pictures had 0.8 to 2; leaves below a log −0.2."""
+GAP = 0.02
+"""Distance over the largest object's size at which a shadow touches an object."""
+GRAZING = 0.05
+"""Cosine on a wall of a lamp that hardly shines on it: what is foreseen there is an error of the wall's direction."""
 CONTACT_SKY = 0.4
 """Share of the sky that an object hides around its contact, where the ground is darker under any light."""
 
@@ -185,8 +190,9 @@ def cast_shadows(
 ) -> list[CastShadow]:
     """Return the shadow of each of ``masks`` (H, W), visible pixels of the objects, with its penumbra.
 
-    pixels: (H, W, 3) sRGB. camera: above the ground z = 0; pixels above the horizon are not ground. stay: (H, W) things
-    on the ground that are no objects; no shadow is looked for on them. All masks of a shadow are disjoint from all
+    Shadows are looked for on the ground and on a wall behind the objects. pixels: (H, W, 3) sRGB. camera: above the
+    ground z = 0; pixels above the horizon are not ground. stay: (H, W) things on the ground that are no objects; no
+    shadow is looked for on them. All masks of a shadow are disjoint from all
     objects and from ``stay``. Shadows of several objects overlap where each of them alone darkens the ground; what they
     block together belongs to the one that blocks most. An object without a pixel, or above the horizon, has no shadow.
     """
@@ -195,43 +201,127 @@ def cast_shadows(
     if not standing:
         return found
     bodies = [body for _, body in standing]
-    ground = ground_pixels(pixels, masks, camera, bodies, stay)
-    if ground is None or len(ground.rows) < FEWEST:
-        return found
-    light = fit_light(ground, bodies)
-    total, alone, hidden = light_shares(ground, bodies, light)
-    distances = np.stack([_distance(ground, masks[index]) for index, _ in standing])
-    owned = _owned(ground, alone, distances)
-    parts = _parts(ground, alone, total, owned)
-    posterior = light_level_posterior(ground, total, np.minimum(hidden.sum(axis=0), 1.0), distances.min(axis=0))
-    probable = [shadow_probability(ground, posterior, *each) for each in zip(parts, owned, strict=True)]
+    outlines = [masks[index] for index, _ in standing]
     closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
-    nothing = np.zeros_like(closed)
-    shown = [observed_darkening(ground, left) > DARKENED for _, _, left in probable]
-    dark = []
-    for (_, _, left), (index, _), kept, seen in zip(probable, standing, alone, shown, strict=True):
-        if not seen:
-            dark.append(nothing)
+    wall = wall_behind(pixels, masks, camera)
+    lamps: tuple[ShadowLamp, ...] = ()
+    cast: list[tuple[Mask, list[_Shade]]] = []
+    for plane in (ground_plane(closed.shape, wall), wall):
+        if plane is None:
             continue
-        darkened = (_full_size(ground, 1.0 - left, closed.shape) > 1.0 - SHADOW_RATIO) & ~closed
-        dark.append(_connected(darkened, masks[index], ground, kept))
+        turned = [replace(body, points=plane.in_frame(body.points)) for body in bodies]
+        ground = ground_pixels(pixels, masks, camera, turned, stay, plane)
+        if ground is None or len(ground.rows) < FEWEST:
+            continue
+        upright = plane is wall
+        if upright:
+            light = fit_wall_light(ground, turned, _turned(lamps, plane) if lamps else None)
+        else:
+            light = fit_light(ground, turned)
+            lamps = light.lamps
+        elsewhere = closed | ~plane.region
+        cast.append((elsewhere, _shades(ground, turned, light, outlines, elsewhere, upright=upright)))
+    if not cast:
+        return found
+    # A shadow on a wall goes on from the one on the ground.
+    whole = [_Shade.joined([shades[position] for _, shades in cast]) for position in range(len(standing))]
+    gap = max(1, round(GAP * max(int(np.ptp(at)) + 1 for mask in outlines for at in np.nonzero(mask))))
+    dark = [_connected(shade.dark, mask, gap, shade.foreseen) for shade, mask in zip(whole, outlines, strict=True)]
     for position, (index, _) in enumerate(standing):
-        if not shown[position]:
-            contact = (_full_size(ground, hidden[position] > CONTACT_SKY, closed.shape) > 0.5) & ~closed
-            found[index] = CastShadow(shadow=nothing, penumbra=nothing, expected=contact)
-            continue
-        inner, outer, _ = probable[position]
-        dim = (_full_size(ground, outer, closed.shape) > 0.5) & ~closed
         # A hard shadow goes on, but not into that of another object.
         others = [other & ~dark[position] for place, other in enumerate(dark) if place != position]
-        shadow = extend_hard_shadow(pixels, dark[position], np.logical_or.reduce([closed, *others]))
-        penumbra = shadow | _touching(dim, shadow)
-        foreseen = (alone[position] < FORESEEN) & (light.share > 0.0)
-        wanted = (hidden[position] > CONTACT_SKY) | (foreseen & (outer > POSSIBLE))
-        expected = (_full_size(ground, wanted, closed.shape) > 0.5) & ~closed
-        missing = float((foreseen & (inner < 0.5)).sum() / foreseen.sum()) if foreseen.sum() >= FEWEST else 0.0
-        found[index] = CastShadow(shadow=shadow, penumbra=penumbra, expected=expected, missing=missing)
+        parts = [
+            extend_hard_shadow(pixels, dark[position] & ~elsewhere, np.logical_or.reduce([elsewhere, *others]))
+            for elsewhere, _ in cast
+        ]
+        shadow, shade = np.logical_or.reduce(parts), whole[position]
+        penumbra = shadow | _touching(shade.dim, shadow)
+        found[index] = CastShadow(shadow=shadow, penumbra=penumbra, expected=shade.expected, missing=shade.missing)
     return found
+
+
+@dataclass(frozen=True)
+class _Shade:
+    """What one object takes from the light of a plane.
+
+    dark, dim: (H, W) where the photo shows it, and the same with the penumbra; foreseen: (H, W) where its body alone
+    should. expected, missing: as of ``CastShadow``; contact: (H, W) what is expected of it where no shadow is seen.
+    darkening: sums of ``darkening_sums``.
+    """
+
+    dark: Mask
+    dim: Mask
+    foreseen: Mask
+    expected: Mask
+    contact: Mask
+    darkening: tuple[float, float]
+    missing: float = 0.0
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Shade]) -> _Shade:
+        """Return those of an object on several planes as one, without shadow unless the photo is darker there;
+        ``missing`` is that of the first, the ground."""
+        layers = [(part.dark, part.dim, part.foreseen, part.expected, part.contact) for part in parts]
+        dark, dim, foreseen, expected, contact = (np.logical_or.reduce(layer) for layer in zip(*layers, strict=True))
+        both, told = (float(sum(values)) for values in zip(*(part.darkening for part in parts), strict=True))
+        if both <= DARKENED * told:
+            nothing = np.zeros_like(dark)
+            return cls(nothing, nothing, nothing, contact, contact, (both, told))
+        return cls(dark, dim, foreseen, expected, contact, (both, told), parts[0].missing)
+
+
+def _turned(lamps: Sequence[ShadowLamp], plane: ShadowPlane) -> list[ShadowLamp]:
+    """``lamps`` over the ground in the frame of ``plane``, as far as they shine on its front."""
+    toward = [plane.axes @ direction_of(lamp.slide) for lamp in lamps]
+    return [
+        replace(lamp, slide=axis[:2] / axis[2]) for lamp, axis in zip(lamps, toward, strict=True) if axis[2] > GRAZING
+    ]
+
+
+def _shades(
+    ground: GroundPixels,
+    bodies: Sequence[ProxyBody],
+    light: ShadowLight,
+    outlines: Sequence[Mask],
+    elsewhere: Mask,
+    *,
+    upright: bool,
+) -> list[_Shade]:
+    """What each of ``bodies`` with ``outlines`` (H, W) takes from the light on ``ground``, a wall if ``upright``.
+
+    elsewhere: (H, W) pixels that do not show that plane.
+    """
+    total, alone, hidden = light_shares(ground, bodies, light)
+    distances = np.stack([_distance(ground, mask) for mask in outlines])
+    owned = _owned(ground, alone, distances)
+    parts = _parts(ground, alone, total, owned)
+    # Around its contact an object darkens the ground under any light, but not a wall.
+    around = np.zeros_like(total) if upright else np.minimum(hidden.sum(axis=0), 1.0)
+    posterior = light_level_posterior(ground, total, around, distances.min(axis=0))
+
+    def shown(values: Values, above: float) -> Mask:
+        return np.asarray((_full_size(ground, values, elsewhere.shape) > above) & ~elsewhere)
+
+    probable = [shadow_probability(ground, posterior, *each) for each in zip(parts, owned, strict=True)]
+    past_all = np.prod([left for _, _, left in probable], axis=0)
+    shades = []
+    for (inner, outer, left), kept, near in zip(probable, alone, hidden, strict=True):
+        cast = kept < FORESEEN
+        foreseen = cast & (light.share > 0.0)
+        reach = cv2.resize(ground.picture(cast.astype(np.float32)), elsewhere.shape[::-1]) > 0.5
+        contact = np.zeros_like(cast) if upright else near > CONTACT_SKY
+        shades.append(
+            _Shade(
+                dark=shown(1.0 - left, 1.0 - SHADOW_RATIO),
+                dim=shown(outer, 0.5),
+                foreseen=np.asarray(reach),
+                expected=shown(contact | (foreseen & (outer > POSSIBLE)), 0.5),
+                contact=shown(contact, 0.5),
+                darkening=darkening_sums(ground, left, past_all / np.maximum(left, 0.01)),
+                missing=float((foreseen & (inner < 0.5)).sum() / foreseen.sum()) if foreseen.sum() >= FEWEST else 0.0,
+            )
+        )
+    return shades
 
 
 def _distance(ground: GroundPixels, mask: Mask) -> Values:
@@ -272,16 +362,13 @@ def _full_size(ground: GroundPixels, values: Values, shape: tuple[int, int]) -> 
     return np.asarray(cv2.resize(filled.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
-def _connected(dark: Mask, mask: Mask, ground: GroundPixels, kept: Values) -> Mask:
-    """The parts of ``dark`` that touch the object in ``mask``, or lie mostly in its cast shadow."""
-    shape = dark.shape
-    gap = max(1, round(0.02 * ground.object_side * shape[1] / ground.known.shape[1]))
+def _connected(dark: Mask, mask: Mask, gap: int, foreseen: Mask) -> Mask:
+    """The parts of ``dark`` within ``gap`` pixels of the object in ``mask``, or mostly where it is ``foreseen``."""
     near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * gap + 1,) * 2, np.uint8)) > 0
-    cast = cv2.resize(ground.picture((kept < 0.8).astype(np.float32)), shape[::-1]) > 0.5
     number, labels = _components(dark)
     sizes = np.bincount(labels.ravel(), minlength=number)
     keep = np.bincount(labels[near], minlength=number) > 0
-    keep |= np.bincount(labels[cast], minlength=number) > 0.5 * sizes
+    keep |= np.bincount(labels[foreseen], minlength=number) > 0.5 * sizes
     keep[0] = False
     return np.asarray(keep[labels])
 

@@ -84,7 +84,7 @@ def light_level_posterior(ground: GroundPixels, kept: Values, hidden: Values, di
     prior[rim] = (1.0 - RIM_SHADOW) * prior[rim] + RIM_SHADOW * IN_SHADOW / IN_SHADOW.sum()
     posterior = prior
     reached = prior @ IN_SHADOW > 0.15
-    terms = smooth_terms(ground.places)
+    terms = smooth_terms(ground.places, ground.extent)
     for _ in range(ROUNDS):
         lit, depth, weight, smooth = _unshaded(ground, terms, posterior)
         samples = relative_colour(ground.colour, smooth)
@@ -117,7 +117,7 @@ def dark_rim(ground: GroundPixels, prior: Values, hidden: Values, distance: Valu
 
     prior: (N, levels) of the light that they keep; hidden, distance: as of ``light_level_posterior``.
     """
-    lit, _, _, smooth = _unshaded(ground, smooth_terms(ground.places), prior)
+    lit, _, _, smooth = _unshaded(ground, smooth_terms(ground.places, ground.extent), prior)
     off = ground.colour - smooth
     luminance = off @ LUMINANCE
     chroma = np.linalg.norm(off - luminance[:, None], axis=1)
@@ -159,18 +159,24 @@ def shadow_probability(
 
 def observed_darkening(ground: GroundPixels, left: Values) -> float:
     """Return how much darker ``ground`` is seen to be over how much darker ``left`` (N,), the share of light that a
-    shadow leaves it, says: about 1 for a shadow, 0 or less for another surface.
+    shadow leaves it, says: about 1 for a shadow, 0 or less for another surface."""
+    both, told = darkening_sums(ground, left, np.ones_like(left))
+    return both / told
 
-    Only what changes within ``STEP`` of the object's size counts. Over more, the ground's colour without the shadow is
-    not known: where it is a smooth field beside one surface, that field can make anything of another one.
+
+def darkening_sums(ground: GroundPixels, left: Values, past_others: Values) -> tuple[float, float]:
+    """Return sums over ``ground`` whose ratio is ``observed_darkening``: those of several planes add up.
+
+    past_others: (N,) share of light that the shadows of other objects leave it. Only what changes within ``STEP`` of
+    the object's size counts. Over more, the ground's colour without the shadow is not known: where it is a smooth field
+    beside one surface, that field can make anything of another one.
     """
     sigma = max(2.0, STEP * ground.object_side)
-    told, seen = (
-        values - ground.blurred(values, sigma) for values in (np.log(np.maximum(left, 0.02)), ground.colour @ LUMINANCE)
-    )
+    logs, others = (np.log(np.maximum(values, 0.02)) for values in (left, past_others))
+    told, seen = (values - ground.blurred(values, sigma) for values in (logs, ground.colour @ LUMINANCE - others))
     # A shadow that claims no darkening is not contradicted: the ratio is 1 then.
     noise = len(told) * LEAST_STEP**2
-    return float(((told * seen).sum() + noise) / (np.square(told).sum() + noise))
+    return float((told * seen).sum() + noise), float(np.square(told).sum() + noise)
 
 
 def _grown(ground: GroundPixels, prior: Values, likelihood: Values, reached: Mask) -> tuple[Values, Mask]:
