@@ -168,8 +168,8 @@ def _handles(seen: _Likeness, strange: Mask) -> list[Mask]:
             _, top, width, height = cv2.boundingRect(part.astype(np.uint8))
             long = float(np.hypot(width, height)) > HANDLE * seen.size
             if long and _joints(joined) > 1 and top + 0.5 * height < feet:
-                # With the mixed pixels between both.
-                result.append(part | (grown(part, 2) & grown(joined, 2)))
+                # With the mixed pixels along it, which are much of it, and between both.
+                result.append(grown(part) | (grown(part, 2) & grown(joined, 2)))
     return result
 
 
