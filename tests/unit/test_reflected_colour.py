@@ -66,6 +66,16 @@ def test_a_grey_thing_has_no_colour_to_throw():
     assert not tinted_ground(view, ball | (added > 0.2)).any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_far_from_what_has_colour_nothing_is_tinted():
+    pixels, pole = np.full((280, 280, 3), 170, np.uint8), np.zeros((280, 280), bool)
+    pole[2:278, 139:141] = True
+    pixels[pole] = 120
+    pixels[218:278, 139:141] = (230, 20, 5)
+    view = crop_around_box(pixels, (100, 2, 180, 278), np.zeros((280, 280), bool))
+    assert not tinted_ground(view, pole).any()
+
+
 def test_what_the_user_keeps_is_no_tint():
     linear, ball, added = tinted_scene((0.9, 0.5, 0.02), 0)
     patch = added > 0.15

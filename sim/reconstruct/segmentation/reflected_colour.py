@@ -85,7 +85,8 @@ def _tint(view: BoxCrop, mask: Mask) -> tuple[Light, Light, Mask] | None:
     if own.sum() < LEAST_SATURATED * mask.sum():
         return None
     colour = _mean_around(np.exp(light), own, LOCAL * size)
-    colour /= colour.max(axis=2, keepdims=True)
+    # Farther away than the mean reaches there is none.
+    colour /= np.maximum(colour.max(axis=2, keepdims=True), 1e-30)
     direct, added = _shares(np.exp(over), colour)
     fitted = np.maximum(direct[..., None] + added[..., None] * colour, 1e-3)
     apart = np.abs(np.log(fitted) - over).max(axis=2)
