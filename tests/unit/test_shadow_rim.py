@@ -9,7 +9,7 @@ from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.lighting.ground_pixels import ground_pixels, proxy_body
 from physgen.sim.reconstruct.lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes
-from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim, observed_darkening
+from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim, darkening_sums
 from PIL import Image
 from scipy import ndimage
 
@@ -70,5 +70,18 @@ def test_a_shadow_is_seen_to_be_darker_than_the_ground_beside_it(kept, least, mo
     pixels, saucer = photo(near, kept)
     ground = ground_pixels(pixels, [saucer], CAMERA, [proxy_body(saucer, CAMERA)])
     small = np.asarray(Image.fromarray(near).resize(ground.known.shape[::-1]))[ground.rows, ground.columns]
-    assert least < observed_darkening(ground, np.where(small, 0.3, 1.0)) < most
-    assert observed_darkening(ground, np.ones(len(small))) == 1.0
+    alone, claimed = np.ones(len(small)), np.where(small, 0.3, 1.0)
+    seen, told = darkening_sums(ground, claimed, alone)
+    assert least < seen / told < most
+    seen, told = darkening_sums(ground, alone, alone)
+    assert seen == told
+
+
+def test_what_another_shadow_darkens_is_not_seen_of_this_one():
+    near = ROWS > 120.0
+    pixels, saucer = photo(near, 0.3)
+    ground = ground_pixels(pixels, [saucer], CAMERA, [proxy_body(saucer, CAMERA)])
+    small = np.asarray(Image.fromarray(near).resize(ground.known.shape[::-1]))[ground.rows, ground.columns]
+    claimed = np.where(small, 0.3, 1.0)
+    seen, told = darkening_sums(ground, claimed, claimed)
+    assert abs(seen / told) < 0.3

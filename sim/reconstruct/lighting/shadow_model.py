@@ -157,19 +157,13 @@ def shadow_probability(
     return shadow, penumbra, np.where(lit, blurred, np.minimum(blurred, kept[0]))
 
 
-def observed_darkening(ground: GroundPixels, left: Values) -> float:
-    """Return how much darker ``ground`` is seen to be over how much darker ``left`` (N,), the share of light that a
-    shadow leaves it, says: about 1 for a shadow, 0 or less for another surface."""
-    both, told = darkening_sums(ground, left, np.ones_like(left))
-    return both / told
-
-
 def darkening_sums(ground: GroundPixels, left: Values, past_others: Values) -> tuple[float, float]:
-    """Return sums over ``ground`` whose ratio is ``observed_darkening``: those of several planes add up.
+    """Return two sums whose ratio is how much darker ``ground`` is seen to be over how much darker ``left`` (N,), the
+    share of light that a shadow leaves it, says: about 1 for a shadow, 0 or less for another surface.
 
-    past_others: (N,) share of light that the shadows of other objects leave it. Only what changes within ``STEP`` of
-    the object's size counts. Over more, the ground's colour without the shadow is not known: where it is a smooth field
-    beside one surface, that field can make anything of another one.
+    The sums of several planes add up. past_others: (N,) share of light that the shadows of other objects leave. Only
+    what changes within ``STEP`` of the object's size counts. Over more, the ground's colour without the shadow is not
+    known: where it is a smooth field beside one surface, that field can make anything of another one.
     """
     sigma = max(2.0, STEP * ground.object_side)
     logs, others = (np.log(np.maximum(values, 0.02)) for values in (left, past_others))
