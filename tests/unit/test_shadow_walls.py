@@ -147,6 +147,17 @@ def test_the_ground_ends_at_its_wall():
     assert ground_plane(ball.shape).region.all()
 
 
+def test_the_edge_of_a_thing_that_stays_is_no_wall():
+    pixels, ball, _, _ = room((0.3, -0.4, 0.8), wall_light=(0.3, 0.22, 0.15))
+    board = np.zeros_like(ball)
+    rows = np.flatnonzero(ball.any(axis=1))
+    board[round(rows.mean()) - 8 : round(rows.mean()) + 8] = True
+    board &= ~ball
+    pixels = np.where(board[..., None], pixels // 2 + np.array([0, 40, 110], np.uint8), pixels)
+    assert wall_behind(pixels, [ball], camera()) is not None, "the drawing itself"
+    assert wall_behind(pixels, [ball], camera(), board) is None
+
+
 def test_a_joint_between_like_tiles_is_no_wall():
     pixels, ball, _, _ = room((0.3, -0.4, 0.8), wall_light=(0.3, 0.22, 0.15))
     foot = wall_behind(pixels, [ball], camera())

@@ -192,9 +192,9 @@ def cast_shadows(
 
     Shadows are looked for on the ground and on a wall behind the objects. pixels: (H, W, 3) sRGB. camera: above the
     ground z = 0; pixels above the horizon are not ground. stay: (H, W) things on the ground that are no objects; no
-    shadow is looked for on them. All masks of a shadow are disjoint from all
-    objects and from ``stay``. Shadows of several objects overlap where each of them alone darkens the ground; what they
-    block together belongs to the one that blocks most. An object without a pixel, or above the horizon, has no shadow.
+    shadow is looked for on them. All masks of a shadow are disjoint from all objects and from ``stay``. Shadows of
+    several objects overlap where each of them alone darkens the ground; what they block together belongs to the one
+    that blocks most. An object without a pixel, or above the horizon, has no shadow.
     """
     found = [CastShadow(*np.zeros((3, *pixels.shape[:2]), dtype=bool)) for _ in masks]
     standing = [(index, body) for index, mask in enumerate(masks) if (body := proxy_body(mask, camera)) is not None]
@@ -203,7 +203,7 @@ def cast_shadows(
     bodies = [body for _, body in standing]
     outlines = [masks[index] for index, _ in standing]
     closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
-    wall = wall_behind(pixels, masks, camera)
+    wall = wall_behind(pixels, masks, camera, stay)
     lamps: tuple[ShadowLamp, ...] = ()
     cast: list[tuple[Mask, list[_Shade]]] = []
     for plane in (ground_plane(closed.shape, wall), wall):
@@ -260,7 +260,7 @@ class _Shade:
     @classmethod
     def joined(cls, parts: Sequence[_Shade]) -> _Shade:
         """Return those of an object on several planes as one, without shadow unless the photo is darker there;
-        ``missing`` is that of the first, the ground."""
+        ``missing`` is that of the first: of the ground if it is seen."""
         layers = [(part.dark, part.dim, part.foreseen, part.expected, part.contact) for part in parts]
         dark, dim, foreseen, expected, contact = (np.logical_or.reduce(layer) for layer in zip(*layers, strict=True))
         both, told = (float(sum(values)) for values in zip(*(part.darkening for part in parts), strict=True))

@@ -73,11 +73,14 @@ BESIDE = 0.35
 """Range beside what hides the edge in which it was traced, over the width of that."""
 
 
-def wall_behind(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera) -> ShadowPlane | None:
+def wall_behind(
+    pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera, stay: Mask | None = None
+) -> ShadowPlane | None:
     """Return the wall that stands on the ground behind the objects in ``masks`` (H, W) of the photo ``pixels``
     (H, W, 3), or None if no straight edge between two surfaces passes behind one of them.
 
-    camera: above the ground z = 0. Everything above such an edge is taken for an upright wall: whether a shadow falls
+    camera: above the ground z = 0. stay: (H, W) things on the ground that are no objects, whose edges are no wall's
+    foot. Everything above such an edge is taken for an upright wall: whether a shadow falls
     on it is for the colours there to say.
     """
     shape, size = pixels.shape[:2], max(pixels.shape[:2])
@@ -85,9 +88,11 @@ def wall_behind(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Camera
     if not covered.any():
         return None
     side = 2 * max(1, round(SEAM * size / 1024.0)) + 1
-    hidden = cv2.dilate(covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
+    seam = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    objects = cv2.dilate(covered.astype(np.uint8), seam)
+    hidden = (objects if stay is None else cv2.dilate((covered | stay).astype(np.uint8), seam)) > 0
     logs = logarithms(pixels.astype(np.float32))
-    number, labels, stats, _ = cv2.connectedComponentsWithStats(hidden.astype(np.uint8), connectivity=8)
+    number, labels, stats, _ = cv2.connectedComponentsWithStats(objects, connectivity=8)
     # The largest thing hides most of an edge, and needs it most.
     for label in 1 + np.argsort(-stats[1:number, cv2.CC_STAT_AREA], kind="stable"):
         part = np.asarray(labels == label)
