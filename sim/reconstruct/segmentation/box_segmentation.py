@@ -196,7 +196,7 @@ def _outlined(pixels: NDArray[np.uint8], box: Box, near: _Surroundings, coarse: 
     mirrored = mirrored_outline(crop, near.box, found, taken, drop)
     if (mirrored != found).any():
         # The outline of a handle goes around what shows through it.
-        through = mirrored & ~open_holes(crop, mirrored, within=shrunk(mirrored & ~found, 3))
+        through = mirrored & ~keep & ~open_holes(crop, mirrored, within=shrunk(mirrored & ~found, 3))
         gaps |= through
         found = settle_outline(crop, mirrored & ~through)
     rim = outer_rim(crop, found, taken | drop)
