@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .box_crop import BoxCrop, edge_crest, edge_strength
+from .box_crop import EDGE, BoxCrop, edge_crest, edge_strength
 from .ground_shade import LOCAL, SPECK, lit_ground, log_light
 from .mask_geometry import Mask, grown
 
@@ -36,8 +36,6 @@ INNER_EDGE, WEAKER, FADED = 0.6, 0.9, 0.75
 """Share of a patch's rim at the object that lies on edges of ``EDGE``; gradient and k along its rim at the ground over
 those at the object, medians, below which it fades: 0.2 to 0.8 and 0.4 to 0.7 were measured beside a clock on a sheet,
 1.0 and more of parts of 60 drawn things."""
-EDGE = 3.0
-"""Gradient of an edge, in CIELAB units per pixel."""
 
 
 def tinted_ground(view: BoxCrop, mask: Mask) -> Mask:
