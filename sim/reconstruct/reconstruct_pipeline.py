@@ -233,7 +233,7 @@ class _Run:
     def decided_by_bodies(
         self, physics: Sequence[ObjectPhysics], bodies: Sequence[Body], seen: Sequence[Mask]
     ) -> tuple[ObjectPhysics, ...]:
-        """Return ``physics`` of each object with what its body and its fur tell besides; the user is told of each."""
+        """Return each object's ``physics``, completed from its shape and its fur; each decision gives a notice."""
         decided = decided_by_shapes(
             physics,
             [body.shape for body in bodies],

@@ -66,10 +66,10 @@ class NormalEquations:
 
     def add(self, own: slice, tail: slice, hessian: Array, slope: Array, following: slice | None = None) -> None:
         """Add equations of the state at ``own``, the numbers at ``tail`` and the next state at ``following``."""
-        places, at = [(own, slice(0, 12)), (tail, slice(12, 12 + len(self.slope) - tail.start))], 0
-        at = places[1][1].stop
+        end = 12 + len(self.slope) - tail.start
+        places = [(own, slice(0, 12)), (tail, slice(12, end))]
         if following is not None:
-            places.append((following, slice(at, at + 12)))
+            places.append((following, slice(end, end + 12)))
         for row, rows in places:
             self.slope[row] += slope[rows]
             for column, columns in places:

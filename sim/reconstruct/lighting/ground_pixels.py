@@ -202,11 +202,12 @@ def ground_pixels(
     share = cv2.resize(open_ground, size, interpolation=cv2.INTER_AREA)
     light = cv2.resize(bytes_to_linear(pixels) * open_ground[..., None], size, interpolation=cv2.INTER_AREA)
     places = plane.places(camera, _centres(width, height, size))
-    use = _near(places, bodies) & (share > 0.3)
+    near = _near(places, bodies)
+    use = near & (share > 0.3)
     if not use.any():
         return None
     # On less ground a smooth field would bend more, and pass soft shadows off as its own.
-    extent = None if plane.region.all() else float(np.ptp(places[_near(places, bodies)][:, :2], axis=0).max())
+    extent = None if plane.region.all() else float(np.ptp(places[near][:, :2], axis=0).max())
     linear = light[use] / share[use][:, None]
     rows, columns = np.nonzero(use)
     return GroundPixels(

@@ -80,8 +80,8 @@ def wall_behind(
     (H, W, 3), or None if no straight edge between two surfaces passes behind one of them.
 
     camera: above the ground z = 0. stay: (H, W) things on the ground that are no objects, whose edges are no wall's
-    foot. Everything above such an edge is taken for an upright wall: whether a shadow falls
-    on it is for the colours there to say.
+    foot. Everything above such an edge is taken for an upright wall: whether a shadow falls on it is for the colours
+    there to say.
     """
     shape, size = pixels.shape[:2], max(pixels.shape[:2])
     covered = np.logical_or.reduce(masks)
