@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""What a setup asks for at given times, and what that, or a caller, changes in the particles of a body.
-
-A change is made in ``state``, arrays of all particles as ``Engine.state`` returns them; rows: which of them are the
-body's, and the number in the body of each.
-"""
+"""What a setup asks for at given times, and what that, or a caller, changes in the particles of a body."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
+from ..constitutive import DeformableMaterial
 from ..errors import InputError
 from . import packing
+from .active_bodies import ActiveBodies
 from .bodies import BodyParticles
 from .colliders import SAME_TIME, Track
+from .engine import Engine, upload_new
 from .particle_store import State, places_in_blocks
 
 Array = NDArray[np.float64]
@@ -33,11 +34,77 @@ class BodyRows(NamedTuple):
     numbers: NDArray[np.int64]
 
 
-def rows_of_body(state: State, first: int, end: int) -> BodyRows:
-    """Return the rows of the particles that the caller numbers ``first`` to ``end``, exclusive."""
-    ids = np.asarray(state["ids"], dtype=np.int64)
-    mine = (ids >= first) & (ids < end)
-    return BodyRows(mine, ids[mine] - first)
+class BodyChanges:
+    """Changes of bodies that have started, in the particles of ``engine``; places: of all worlds, in their order."""
+
+    def __init__(self, engine: Engine, places: Sequence[packing.WorldSlot], bodies: ActiveBodies) -> None:
+        self._engine = engine
+        self._places = tuple(places)
+        self._bodies = bodies
+        # By the body's number among all: what it has on its parameters' tracks, and how stiff its particles are
+        # relative to that.
+        self._followed: dict[int, DeformableMaterial] = {}
+        self._shares: dict[int, ti.Ndarray] = {}
+
+    def follow_parameters(self, times: Array, stops: Array) -> None:
+        """Give bodies with tracks of parameters what those have midway between ``times`` (W,) and ``stops`` (W,)."""
+        middle = 0.5 * (times + stops)
+        changed = False
+        for place in self._places:
+            for i in place.soft:
+                body, number = place.setup.bodies[i], self._number(place, i)
+                if not body.parameter_tracks or not self._bodies.started[number]:
+                    continue
+                material = body.material_at(float(middle[place.world]))
+                if self._followed.get(number) == material:
+                    continue
+                if number not in self._shares:
+                    choice = material_choice(body, float(times[place.world]) + SAME_TIME)
+                    self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
+                offset, shares = int(self._bodies.offsets[number]), self._shares[number]
+                self._engine.particles.set_moduli(offset, shares, material.shear_number, material.bulk_number)
+                self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
+                self._followed[number] = material
+                changed = True
+        if changed:
+            self._engine.set_materials(packing.material_table(self._places, list(middle)))
+
+    def change_material(self, place: packing.WorldSlot, index: int, now: float) -> None:
+        """Switch the body's particles to their material at ``now``; their history variables are reset."""
+        number = self._number(place, index)
+        self._shares.pop(number, None)
+        self._followed.pop(number, None)
+        state = self._engine.state()
+        choice = material_choice(place.setup.bodies[index], now)
+        wave_speed = _switch_material(state, self.rows(state, number), place, index, choice)
+        self._engine.replace(state)
+        self._engine.expect(place.world, wave_speed=wave_speed)
+
+    def set_velocity(self, place: packing.WorldSlot, index: int, velocity: Array) -> None:
+        """Set the body's mean velocity (3,), m/s."""
+        state = self._engine.state()
+        rows = self.rows(state, self._number(place, index))
+        fastest = _shift_velocity(state, rows, velocity * place.cells.scale)
+        self._engine.replace(state)
+        self._engine.expect(place.world, speed=fastest)
+
+    def set_motion(self, place: packing.WorldSlot, index: int, given: dict[str, Array]) -> None:
+        """Set the motion of every particle of the body to what is ``given``, see ``checked_motion``."""
+        state = self._engine.state()
+        _put_motion(state, self.rows(state, self._number(place, index)), place, index, given)
+        self._engine.replace(state)
+        fastest = float(np.linalg.norm(given["velocities"], axis=1).max())
+        self._engine.expect(place.world, speed=fastest * place.cells.scale)
+
+    def rows(self, state: State, number: int) -> BodyRows:
+        """Return which particles of ``state`` are those of body ``number`` of all."""
+        ids = np.asarray(state["ids"], dtype=np.int64)
+        first, end = int(self._bodies.offsets[number]), int(self._bodies.offsets[number + 1])
+        mine = (ids >= first) & (ids < end)
+        return BodyRows(mine, ids[mine] - first)
+
+    def _number(self, place: packing.WorldSlot, index: int) -> int:
+        return self._bodies.of(place.world).start + index
 
 
 def next_stop(place: packing.WorldSlot, now: float, end: float) -> float:
@@ -80,10 +147,10 @@ def velocity_due(body: BodyParticles, then: float, now: float) -> Array | None:
     return None if keys is None or not due else keys.values[due[-1]]
 
 
-def change_material(
+def _switch_material(
     state: State, rows: BodyRows, place: packing.WorldSlot, index: int, choice: NDArray[np.int32]
 ) -> float:
-    """Switch the particles of body ``index`` to other materials (N,) from now on, and reset their history variables.
+    """Switch the particles of body ``index`` in ``state`` to other materials (N,), and reset their history variables.
 
     Returns the speed in cells/s of the fastest wave in them.
     """
@@ -94,7 +161,7 @@ def change_material(
     return wave_speed
 
 
-def set_mean_velocity(state: State, rows: BodyRows, velocity: Array) -> float:
+def _shift_velocity(state: State, rows: BodyRows, velocity: Array) -> float:
     """Set the mean ``velocity`` (3,) of a body, cells/s, and return the speed of its fastest particle."""
     given = np.asarray(state["v"][rows.mine], dtype=np.float64)
     masses = np.asarray(state["constants"][rows.mine, 0], dtype=np.float64)
@@ -103,7 +170,7 @@ def set_mean_velocity(state: State, rows: BodyRows, velocity: Array) -> float:
     return float(np.linalg.norm(given, axis=1).max())
 
 
-def set_motion(state: State, rows: BodyRows, place: packing.WorldSlot, index: int, given: dict[str, Array]) -> None:
+def _put_motion(state: State, rows: BodyRows, place: packing.WorldSlot, index: int, given: dict[str, Array]) -> None:
     """Set the motion of every particle of body ``index`` to what is ``given``, see ``checked_motion``."""
     count, scale = place.setup.bodies[index].count, place.cells.scale
     new: dict[str, NDArray[np.generic]] = {

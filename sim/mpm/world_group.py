@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
-from ..constitutive import DeformableMaterial
 from ..errors import Cancelled, InputError, SimulationError
 from ..events import IsCancelled, never
 from ..memory import return_freed_memory
@@ -20,7 +18,7 @@ from . import packing
 from .active_bodies import ActiveBodies
 from .colliders import SAME_TIME
 from .diagnostics import FittedGradients
-from .engine import MOST_RETRIES, Diverged, Engine, Stopped, upload_new
+from .engine import MOST_RETRIES, Diverged, Engine, Stopped
 from .kernels import layout, runtime
 from .kernels.lanes import lanes_of, windows_of
 from .kernels.time_stepping import RIGID_LOST
@@ -28,17 +26,7 @@ from .particle_store import State
 from .quiet_matter import new_quiet_matter
 from .rigid.rigid_bodies import RigidBodies, RigidPose
 from .solver_options import SolverOptions
-from .timed_events import (
-    BodyRows,
-    change_material,
-    checked_motion,
-    material_choice,
-    next_stop,
-    rows_of_body,
-    set_mean_velocity,
-    set_motion,
-    velocity_due,
-)
+from .timed_events import BodyChanges, checked_motion, material_choice, next_stop, velocity_due
 from .world_setup import WorldSetup, check_start
 
 Array = NDArray[np.float64]
@@ -82,11 +70,10 @@ class WorldGroup:
         self._between = False
         self._rigid_bodies = self._new_rigid_bodies()
         self._engine = self._new_engine()
+        self._changes = BodyChanges(self._engine, self._places, self._bodies)
         self._host: State | None = None
         self._poses: dict[tuple[int, str], RigidPose] = {}
         self._fits: dict[int, FittedGradients] = {}
-        self._followed: dict[int, DeformableMaterial] = {}
-        self._shares: dict[int, ti.Ndarray] = {}
         self._quiet_matter = (
             new_quiet_matter(self._places, self._bodies.offsets, self.arch) if self.options.implicit else None
         )
@@ -170,7 +157,7 @@ class WorldGroup:
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
-            self._follow_parameters(stops)
+            self._changes.follow_parameters(self._times, stops)
             if self._rigid_bodies.count:
                 moving = np.flatnonzero(stops > self._times)
                 self._rigid_bodies.set_segments({int(w): (float(self._times[w]), float(stops[w])) for w in moving})
@@ -201,30 +188,6 @@ class WorldGroup:
     def _longest_step(self, place: packing.WorldSlot) -> float:
         """Longest substep in s apart from waves: the option's, and that of springs."""
         return min([self.options.max_step, *(body.spring_step for body in place.setup.bodies)])
-
-    def _follow_parameters(self, stops: Array) -> None:
-        """Give bodies with tracks of parameters what those have in the middle of the segments up to ``stops`` (W,)."""
-        middle = 0.5 * (self._times + stops)
-        changed = False
-        for place in self._places:
-            first = self._bodies.of(place.world).start
-            for i in place.soft:
-                body, number = place.setup.bodies[i], first + i
-                if not body.parameter_tracks or not self._bodies.started[number]:
-                    continue
-                material = body.material_at(float(middle[place.world]))
-                if self._followed.get(number) == material:
-                    continue
-                if number not in self._shares:
-                    choice = material_choice(body, float(self._times[place.world]) + SAME_TIME)
-                    self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
-                offset, shares = int(self._bodies.offsets[number]), self._shares[number]
-                self._engine.particles.set_moduli(offset, shares, material.shear_number, material.bulk_number)
-                self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
-                self._followed[number] = material
-                changed = True
-        if changed:
-            self._engine.set_materials(packing.material_table(self._places, list(middle)))
 
     def _wake_touched(self) -> Array:
         """Wake the bodies that moving ones have come to touch; for each world (W,) the time until which none else is.
@@ -305,38 +268,16 @@ class WorldGroup:
             for i, body in enumerate(place.setup.bodies):
                 if self._bodies.started[self._bodies.of(place.world).start + i] and not body.rigid:
                     if any(then < time <= now for time, _ in body.material_track):
-                        self._change_material(place, i, now)
+                        self._changes.change_material(place, i, now)
+                        self._host = None
                     velocity = velocity_due(body, then, now)
                     if velocity is not None:
-                        self._set_velocity(place, i, velocity)
+                        self._changes.set_velocity(place, i, velocity)
+                        self._host = None
 
     def material_choice(self, world: int, index: int) -> NDArray[np.int32]:
         """Present material of each particle of body ``index``, counted as in ``material_index``."""
         return material_choice(self.setups[world].bodies[index], float(self._times[world]) + SAME_TIME)
-
-    def _rows_of(self, state: State, number: int) -> BodyRows:
-        return rows_of_body(state, int(self._bodies.offsets[number]), int(self._bodies.offsets[number + 1]))
-
-    def _change_material(self, place: packing.WorldSlot, body_index: int, now: float) -> None:
-        """Switch the body's particles to another material from now on; their history variables are reset."""
-        number = self._bodies.of(place.world).start + body_index
-        self._shares.pop(number, None)
-        self._followed.pop(number, None)
-        state = self._engine.state()
-        choice = material_choice(place.setup.bodies[body_index], now)
-        wave_speed = change_material(state, self._rows_of(state, number), place, body_index, choice)
-        self._engine.replace(state)
-        self._engine.expect(place.world, wave_speed=wave_speed)
-        self._host = None
-
-    def _set_velocity(self, place: packing.WorldSlot, body_index: int, velocity: Array) -> None:
-        """Set the body's mean velocity, m/s."""
-        number = self._bodies.of(place.world).start + body_index
-        state = self._engine.state()
-        fastest = set_mean_velocity(state, self._rows_of(state, number), velocity * place.cells.scale)
-        self._engine.replace(state)
-        self._engine.expect(place.world, speed=fastest)
-        self._host = None
 
     def set_motion(
         self,
@@ -355,10 +296,9 @@ class WorldGroup:
             kind = "is rigid" if body.rigid else "has not started"
             raise InputError(f"body {body.name!r} {kind}: give motion to bodies of particles that have started")
         given = checked_motion(body.name, body.count, velocities, velocity_gradients, positions, gradients)
-        state = dict(self.state())
-        set_motion(state, self._rows_of(state, number), place, index, given)
-        self._engine.replace(state)
-        self._engine.expect(world, speed=float(np.linalg.norm(given["velocities"], axis=1).max()) * place.cells.scale)
+        self._check_generation()
+        self._check_whole()
+        self._changes.set_motion(place, index, given)
         self._host = None
 
     def _lost(self, failure: Diverged) -> SimulationError:
@@ -428,7 +368,7 @@ class WorldGroup:
         if not self._bodies.started[number]:
             return resting
         state = self.state()
-        rows = self._rows_of(state, number)
+        rows = self._changes.rows(state, number)
         values = np.asarray(state[name][rows.mine], dtype=np.float64)
         ordered = np.empty_like(values)
         ordered[rows.numbers] = values
@@ -481,7 +421,7 @@ class WorldGroup:
             self._rigid_bodies.restore(rigid_bodies)
         self._engine = self._new_engine()
         self._engine.restore(checkpoint)
-        self._followed, self._shares = {}, {}
+        self._changes = BodyChanges(self._engine, self._places, self._bodies)
         self._between = False
         self._host = None
         self._poses = {}
