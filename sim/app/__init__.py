@@ -15,6 +15,7 @@ clip_check.py          warnings about a clip before it is rendered
 bake.py                scene folder → bake folder
 bake_options.py        its options and the hash of its inputs
 bake_estimate.py       its cost, and whether objects stay at rest, without running it
+bake_run.py            the loop over its frames
 bake_samples.py        its contents at each frame
 bake_resume.py         checkpoints, and repair of a damaged bake
 bake_transfer.py       a bake of Blender's scene for the photo's

@@ -107,15 +107,50 @@ def prepare_world(
     if scene.ground is not None:
         for i in moving:
             require_above_ground(scene.objects[i].name, meshes[i].vertices, scene.ground, cell)
+    setup, notices = _world_setup(folder, meshes, options.seed, spacing=spacing, cell=cell)
+    warnings += notices
+    solver = dataclasses.replace(solver, max_step=longest_step(setup.bodies, solver))
+    step = stable_step(setup.bodies, cell, solver)
+    explicit_because = why_explicit(setup)
+    stiff = options.implicit and may_pay(setup, step, cell)
+    solver = dataclasses.replace(solver, implicit=stiff and explicit_because is None)
+    duration = (options.frames - 1) / options.rate
+    files = max(_file_bytes(folder, item) for item in scene.objects)
+    body_index, collider_index = ({number: index for index, number in enumerate(found)} for found in (moving, still))
+    return PreparedWorld(
+        setup=setup,
+        solver=solver,
+        similarity=similarity,
+        body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
+        collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
+        warnings=tuple(warnings),
+        cost=_cost(setup, _soft_count(setup), step, duration, options.arch, files),
+        stable_step=step,
+        duration=duration,
+        arch=options.arch,
+        file_bytes=files,
+        explicit_because=explicit_because if stiff else None,
+    )
+
+
+def _world_setup(
+    folder: Scene, meshes: Sequence[ObjectMesh], seed: int, *, spacing: float, cell: float
+) -> tuple[WorldSetup, list[str]]:
+    """Return the description of the scene's world, its effects applied, and notices about it.
+
+    seed: other than 0 moves particles off their lattice. spacing: of particles, m. cell: of the grid, m.
+    """
+    scene = folder.model
+    pairs = list(zip(scene.objects, meshes, strict=True))
     granular = granular_names(scene)
     bodies = tuple(
-        body_of(folder, item, meshes[i], spacing, cell, options.seed, scattered=item.name in granular)
-        for i, item in ((i, scene.objects[i]) for i in moving)
+        body_of(folder, item, mesh, spacing, cell, seed, scattered=item.name in granular)
+        for item, mesh in pairs
+        if item.role == "dynamic"
     )
-    colliders = colliders_of(folder, [(scene.objects[i], meshes[i]) for i in still])
-    warnings += [text for collider in colliders for text in jump_notices(collider)]
+    colliders = colliders_of(folder, [(item, mesh) for item, mesh in pairs if item.role == "collider"])
+    notices = [text for collider in colliders for text in jump_notices(collider)]
     apart = separate(bodies, colliders, spacing=spacing, cell=cell)
-    warnings += apart.notices
     setup = WorldSetup(
         bodies=apart.bodies,
         ground=scene.ground,
@@ -124,31 +159,7 @@ def prepare_world(
         colliders=apart.colliders,
         contacts=contact_table(scene),
     )
-    setup = apply_effects(setup, scene.effects)
-    solver = dataclasses.replace(solver, max_step=longest_step(setup.bodies, solver))
-    step = stable_step(setup.bodies, cell, solver)
-    explicit_because = why_explicit(setup)
-    stiff = options.implicit and may_pay(setup, step, cell)
-    solver = dataclasses.replace(solver, implicit=stiff and explicit_because is None)
-    duration = (options.frames - 1) / options.rate
-    count = _soft_count(setup)
-    files = max(_file_bytes(folder, item) for item in scene.objects)
-    body_index = {scene_index: index for index, scene_index in enumerate(moving)}
-    collider_index = {scene_index: index for index, scene_index in enumerate(still)}
-    return PreparedWorld(
-        setup=setup,
-        solver=solver,
-        similarity=similarity,
-        body_of_object=tuple(body_index.get(i) for i in range(len(scene.objects))),
-        collider_of_object=tuple(collider_index.get(i) for i in range(len(scene.objects))),
-        warnings=tuple(warnings),
-        cost=_cost(setup, count, step, duration, options.arch, files),
-        stable_step=step,
-        duration=duration,
-        arch=options.arch,
-        file_bytes=files,
-        explicit_because=explicit_because if stiff else None,
-    )
+    return apply_effects(setup, scene.effects), [*notices, *apart.notices]
 
 
 def _file_bytes(folder: Scene, item: SceneObject) -> int:

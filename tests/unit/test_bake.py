@@ -242,7 +242,7 @@ def test_a_broken_checkpoint_costs_a_fresh_start(ball_scene, tmp_path):
         checkpoint.write_bytes(content)
         save = load_manifest(tmp_path / "bake")
         assert bake(load_scene(folder.root), out=tmp_path / "bake", options=QUICK).manifest.state == "complete"
-        bake_module.save_manifest(tmp_path / "bake", save)
+        save_manifest(tmp_path / "bake", save)
 
 
 def test_a_folder_of_somebody_elses_is_left_alone(ball_scene, tmp_path):

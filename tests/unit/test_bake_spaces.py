@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from physgen.batch.cli import main
 from physgen.sim.app import bake as bake_module
-from physgen.sim.app import bake_worker
+from physgen.sim.app import bake_run, bake_worker
 from physgen.sim.app.bake import bake
 from physgen.sim.app.bake_estimate import bake_cost, estimate_bake
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
@@ -120,7 +120,7 @@ def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_s
     assert disk_usage(tmp_path / "whole") <= bake_cost(folder, options).disk_bytes
 
     # Stopped again and again, in the middle of frames, with the state kept as often as can be.
-    monkeypatch.setattr(bake_module, "KEEP_SECONDS", 0.0)
+    monkeypatch.setattr(bake_run, "KEEP_SECONDS", 0.0)
     stops = 0
     for _ in range(20):
         left = iter([False] * 100)
@@ -146,7 +146,7 @@ def test_particles_are_kept_in_the_same_space_and_go_on_to_the_same_bytes(ball_s
 
 
 def test_frames_can_be_played_as_they_arrive(ball_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(bake_module, "MANIFEST_SECONDS", 0.0)
+    monkeypatch.setattr(bake_run, "MANIFEST_SECONDS", 0.0)
     folder, out = ball_scene(preset="sand"), tmp_path / "bake"
     seen = []
 
@@ -172,9 +172,9 @@ def test_a_bake_that_is_killed_again_and_again_ends_with_the_same_bytes(ball_sce
     code = f"""
 import json, sys
 from pathlib import Path
-from physgen.sim.app import bake as module
+from physgen.sim.app import bake as module, bake_run
 from physgen.sim.scene.folder import load_scene
-module.CHECKPOINT_SECONDS = module.KEEP_SECONDS = module.MANIFEST_SECONDS = 0.0
+bake_run.CHECKPOINT_SECONDS = bake_run.KEEP_SECONDS = bake_run.MANIFEST_SECONDS = 0.0
 options = module.BakeOptions(frames=6, fps=24.0, quality="preview", points=True)
 module.bake(load_scene(Path({str(folder.root)!r})), out={str(tmp_path / "parts")!r}, options=options,
             on_event=lambda event: print(json.dumps(event), flush=True))
@@ -215,8 +215,8 @@ def test_a_disk_that_is_full_of_particles_keeps_what_was_good(ball_scene, own_ke
 
     # Without a checkpoint, which is larger than that and due when a busy machine has taken 20 s.
     code = (
-        "import sys; from physgen.sim.app import bake, bake_worker; "
-        "bake.CHECKPOINT_SECONDS = 1e9; sys.exit(bake_worker.main(sys.argv[1:]))"
+        "import sys; from physgen.sim.app import bake_run, bake_worker; "
+        "bake_run.CHECKPOINT_SECONDS = 1e9; sys.exit(bake_worker.main(sys.argv[1:]))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "job.json")],

@@ -17,7 +17,7 @@ from physgen.batch.commands.scene_commands import check_folder
 from physgen.physgen_addon.frames.frame_files import write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex
 from physgen.physgen_addon.playback import bake_record
-from physgen.sim.app import bake as bake_module
+from physgen.sim.app import bake_run
 from physgen.sim.app.bake import bake
 from physgen.sim.app.bake_options import BakeOptions
 from physgen.sim.app.bake_resume import Checkpoint, resume, save_checkpoint
@@ -280,7 +280,7 @@ def test_an_engine_that_refuses_a_state_is_left_as_it_was(tmp_path):
 def test_samples_are_on_the_disk_before_the_checkpoint_that_stands_for_them(ball_scene, tmp_path, monkeypatch):
     order = []
     real_sync = os.fsync
-    monkeypatch.setattr(bake_module, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(bake_run, "CHECKPOINT_SECONDS", -1.0)
     monkeypatch.setattr(
         os, "fsync", lambda number: (order.append(os.path.realpath(f"/proc/self/fd/{number}")), real_sync(number))[1]
     )
