@@ -7,7 +7,7 @@ primitives.py          boxes, spheres, surfaces of revolution; primitive_fit.py 
 inflate.py             thickness of a silhouette; inflated_mesh.py its mesh
 reference_surfaces.py  middle surfaces of inflated bodies, from a wall, legs or a depth map; legs.py finds legs,
                        lying.py lays rings and sticks on the ground, floor_limbs.py what lies in front of a body
-furniture.py           chairs, tables and shelves as boards
+furniture.py           chairs, tables and shelves as boards; boards.py their mesh
 surface_mesh.py        marching cubes at a wanted number of vertices
 stability.py           how safely a body stands, and a broader base
 object_placement.py    supports, what hangs, and bodies apart

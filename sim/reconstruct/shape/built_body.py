@@ -14,8 +14,9 @@ from ...scene.model import Camera
 from ..camera.depth_map import DepthMap
 from ..reconstruct_options import ObjectRequest, ReconstructOptions
 from ..stage_cache import Notice
+from .boards import board_mesh
 from .body_texture import colour_pixels, corner_pixels
-from .furniture import furniture_boards, furniture_mesh
+from .furniture import furniture_boards
 from .inflate import Crop, crop_mask, inflate
 from .inflated_mesh import TOPPLES, BodyMesh, inflated_mesh
 from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
@@ -195,7 +196,7 @@ def _furniture(
     if boards is None:
         return None
     try:
-        mesh, _ = furniture_mesh(camera, crop, boards, target)
+        mesh, _ = board_mesh(camera, crop, boards, target)
     except InputError:
         return None
     margin, fit = support_of(mesh.vertices, mesh.faces).steadiness, silhouette_overlap(camera, mesh, full)

@@ -6,12 +6,11 @@ direction and depth: legs whose feet lie farther back stand farther back. What l
 sheet, as the camera sees it from the front: an apron above the front legs, a level seat or table top back to the hind
 legs, and an upright back over them. Each of these is a board: a slab of the world times a region of the photo, so that
 holes stay holes and the outline is kept exactly. Hind legs that the front ones hide are added behind them. A frame with
-holes and without such legs, a shelf, becomes one deep lattice. The mesh is the union of the boards, by marching cubes.
+holes and without such legs, a shelf, becomes one deep lattice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,10 +20,9 @@ from scipy import ndimage
 
 from ...scene.model import Camera
 from ..camera.ground_camera import ground_depth, on_ground
-from .inflate import Crop, is_box, signed_distance
-from .inflated_mesh import BodyMesh, standing_mesh
+from .boards import Board, GroundAxes, level_slab
+from .inflate import Crop, is_box
 from .legs import Leg, find_legs, outline_size
-from .surface_mesh import RayField, relax, surface_of_size
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -49,29 +47,6 @@ FRAME_RODS = 0.2
 """Largest width of a frame's widest rod over the outline's longer side."""
 LOW_BACK = 0.25
 """Least height of a back over that of the seat."""
-OVERLAP_PX = 3.0
-"""Pixels by which neighbouring regions overlap, so that their boards are joined."""
-
-
-@dataclass(frozen=True)
-class Slab:
-    """All points of the world whose position · normal lies between ``low`` and ``high``. normal: (3,) unit."""
-
-    normal: Points
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Board:
-    """Material inside all ``slabs`` where the photo shows ``region`` (h, w), bool on the crop."""
-
-    region: Mask
-    slabs: tuple[Slab, ...]
-
-
-def _level(low: float, high: float) -> Slab:
-    return Slab(np.array([0.0, 0.0, 1.0]), low, high)
 
 
 def furniture_legs(crop: Crop) -> list[Leg]:
@@ -107,27 +82,10 @@ def is_frame(crop: Crop) -> bool:
     return large >= FRAME_HOLES[0] and 2.0 * float(crop.distance.max()) < FRAME_RODS * size and is_box(solid > 0)
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """Axes on the ground: across and away, (2,) unit; foot: (2,) a point of the front line."""
-
-    across: Points
-    away: Points
-
-    def v(self, points: Points) -> Points:
-        return np.asarray(points[..., :2] @ self.away)
-
-    def u(self, points: Points) -> Points:
-        return np.asarray(points[..., :2] @ self.across)
-
-    def slab(self, low: float, high: float) -> Slab:
-        return Slab(np.array([self.away[0], self.away[1], 0.0]), low, high)
-
-
 MAX_YAW = np.radians(50.0)
 
 
-def _axes(feet: Points) -> _Frame:
+def _axes(feet: Points) -> GroundAxes:
     """Axes of the piece from its ``feet`` (n, 3) on the ground: along the longest front side of their hull."""
     best = (0.0, 0.0)
     front = float(feet[:, 1].min())
@@ -145,7 +103,7 @@ def _axes(feet: Points) -> _Frame:
                 if score > best[0]:
                     best = (score, yaw)
     yaw = best[1]
-    return _Frame(np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)]))
+    return GroundAxes(np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)]))
 
 
 def furniture_boards(camera: Camera, crop: Crop, *, asked: bool = False) -> list[Board] | None:
@@ -176,15 +134,15 @@ def _lattice(camera: Camera, crop: Crop) -> list[Board] | None:
     legs = find_legs(crop.mask, THIN * outline_size(crop.mask), 1.0)
     feet = np.array([on_ground(camera, _photo(crop, leg)) for leg in legs]) if len(legs) >= 2 else touch[None]
     feet = feet[np.isfinite(feet).all(axis=1)]
-    frame = _axes(feet) if len(feet) >= 2 else _Frame(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    axes = _axes(feet) if len(feet) >= 2 else GroundAxes(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     unit = float(ground_depth(camera, camera.rays(lowest))) / camera.fx
     depth = FRAME_DEPTH * min(len(columns), len(rows)) * unit
-    front = float(frame.v(touch))
-    return _framed(camera, crop, frame, front, front + depth, unit, legs)
+    front = float(axes.v(touch))
+    return _framed(camera, crop, axes, front, front + depth, unit, legs)
 
 
 def _framed(
-    camera: Camera, crop: Crop, frame: _Frame, front: float, back: float, unit: float, legs: list[Leg]
+    camera: Camera, crop: Crop, axes: GroundAxes, front: float, back: float, unit: float, legs: list[Leg]
 ) -> list[Board]:
     """Level boards between deep uprights. The camera sees the boards' upper sides, which tell how deep they are."""
     mask = crop.mask
@@ -197,7 +155,7 @@ def _framed(
     ]
     thick = (float(np.median(widths)) if widths else 2.0 * float(crop.distance.max())) * unit
     rays = camera.rays(crop.pixels())
-    z_front = _height_on(camera, rays, frame, front).reshape(mask.shape)
+    z_front = axes.heights_on(camera, rays, front).reshape(mask.shape)
     labels, count = ndimage.label(bars)
     levels, depths = [], []
     for index in range(1, count + 1):
@@ -205,7 +163,7 @@ def _framed(
         lowest = float(
             np.median([z_front[np.flatnonzero(part[:, c])[-1], c] for c in np.flatnonzero(part.any(axis=0))])
         )
-        reach = _reach_on(camera, rays, frame, lowest + thick).reshape(mask.shape)[part]
+        reach = axes.reach_on(camera, rays, lowest + thick).reshape(mask.shape)[part]
         seen = reach[np.isfinite(reach)]
         if len(seen):
             depths.append(float(np.quantile(seen, 0.98)) - front)
@@ -216,12 +174,12 @@ def _framed(
     boards = []
     for part, lowest in levels:
         # A pixel lower, or the region's lower edge would not be reached.
-        boards.append(Board(part, (_level(lowest - unit, lowest + thick), frame.slab(front, back))))
+        boards.append(Board(part, (level_slab(lowest - unit, lowest + thick), axes.slab(front, back))))
         face = part & (z_front <= lowest + thick)
-        behind = part & (_reach_on(camera, rays, frame, lowest + thick).reshape(mask.shape) > back)
-        boards.append(Board(face, (frame.slab(front, front + thick), _level(-np.inf, lowest + thick))))
-        boards.append(Board(behind, (frame.slab(back - thick, back),)))
-    boards.append(Board(upright | (mask & ~bars), (frame.slab(front, back),)))
+        behind = part & (axes.reach_on(camera, rays, lowest + thick).reshape(mask.shape) > back)
+        boards.append(Board(face, (axes.slab(front, front + thick), level_slab(-np.inf, lowest + thick))))
+        boards.append(Board(behind, (axes.slab(back - thick, back),)))
+    boards.append(Board(upright | (mask & ~bars), (axes.slab(front, back),)))
     return [board for board in boards if board.region.any()]
 
 
@@ -237,10 +195,26 @@ def _runs(line: NDArray[np.bool_]) -> list[int]:
     return [int(n) for n in ends[1::2] - ends[::2]]
 
 
-def _standing(camera: Camera, crop: Crop, legs: list[Leg]) -> list[Board] | None:
+@dataclass(frozen=True)
+class _Stance:
+    """How a piece stands on its legs.
+
+    depths: (n,) of the middles of its legs along ``axes.away``, m; is_front: (n,) which of them stand in front, whose
+    mean depth is ``front``. width: of a leg, m. span: of the feet along the front, m.
+    """
+
+    axes: GroundAxes
+    depths: Points
+    is_front: Mask
+    front: float
+    width: float
+    span: float
+
+
+def _stance(camera: Camera, crop: Crop, legs: list[Leg]) -> _Stance:
     feet = np.array([on_ground(camera, _photo(crop, leg)) for leg in legs])
-    frame = _axes(feet)
-    v, u = frame.v(feet), frame.u(feet)
+    axes = _axes(feet)
+    v, u = axes.v(feet), axes.u(feet)
     unit = float(ground_depth(camera, camera.rays(_photo(crop, legs[int(np.argmin(v))])))) / camera.fx
     width = float(np.median([leg.width for leg in legs])) * unit
     span = max(float(np.ptp(u)), 4.0 * width)
@@ -249,39 +223,80 @@ def _standing(camera: Camera, crop: Crop, legs: list[Leg]) -> list[Board] | None
         is_front = v <= np.sort(v)[1]
     # What touches the ground visibly is the front edge of a foot.
     v = v + 0.5 * width
-    front = float(np.mean(v[is_front]))
+    return _Stance(axes, v, is_front, float(np.mean(v[is_front])), width, span)
+
+
+def _standing(camera: Camera, crop: Crop, legs: list[Leg]) -> list[Board] | None:
+    """The boards of a piece with a seat or table top on ``legs``; None if those end just above the ground."""
+    stance = _stance(camera, crop, legs)
+    axes, front, width, span = stance.axes, stance.front, stance.width, stance.span
     shape = crop.mask.shape
-    pixels = crop.pixels()
-    rays = camera.rays(pixels)
-    z_front = _height_on(camera, rays, frame, front).reshape(shape)
-    tops = []
-    for leg, first in zip(legs, is_front, strict=True):
-        if first:
-            tops.append(float(z_front[leg.rows[-1], (leg.left[-1] + leg.right[-1]) // 2]))
+    rays = camera.rays(crop.pixels())
+    z_front = axes.heights_on(camera, rays, front).reshape(shape)
+    tops = [
+        float(z_front[leg.rows[-1], (leg.left[-1] + leg.right[-1]) // 2])
+        for leg, first in zip(legs, stance.is_front, strict=True)
+        if first
+    ]
     under = float(np.median(tops))
     if under < 2.0 * width:
         return None
-    leg_pixels = np.zeros(shape, dtype=bool)
-    parts: list[tuple[Mask, float]] = []
-    for leg, depth in zip(legs, v, strict=True):
-        own = leg.region(shape) & crop.mask
-        leg_pixels |= own
-        parts.append((own, float(depth)))
+    uprights = [(leg.region(shape) & crop.mask, float(depth)) for leg, depth in zip(legs, stance.depths, strict=True)]
+    leg_pixels = np.any([region for region, _ in uprights], axis=0)
     # What else is seen below the seat: hind legs beside the front ones, and rungs.
     below = crop.mask & ~leg_pixels & (z_front < under - 0.25 * width)
-    hind = [float(depth) for depth, first in zip(v, is_front, strict=True) if not first]
-    for part, depth in _below(camera, crop, frame, below, legs, front - 0.5 * width, span):
-        depth += 0.5 * width
-        parts.append((part, depth))
-        if depth > front + 0.25 * span:
-            hind.append(depth)
-    top, half = under + width, width / 2.0
-    sheet = crop.mask & ~leg_pixels & ~below
+    further = [
+        (part, depth + 0.5 * width)
+        for part, depth in _below(camera, crop, axes, below, legs, front - 0.5 * width, span)
+    ]
+    hind = [float(depth) for depth, first in zip(stance.depths, stance.is_front, strict=True) if not first]
+    hind += [depth for _, depth in further if depth > front + 0.25 * span]
+    top = under + width
+    sheet = _sheet(camera, rays, crop.mask & ~leg_pixels & ~below, z_front, stance, hind, top)
+    boards = _upright_boards(camera, crop, rays, stance, [*uprights, *further], top)
+    boards += sheet.boards(stance, top)
+    if len(hind) < 2:
+        # Hind legs are hidden behind the outer front legs.
+        z_back = axes.heights_on(camera, rays, sheet.back).reshape(shape)
+        outer = [leg for leg, first in zip(legs, stance.is_front, strict=True) if first]
+        for leg in {id(item): item for item in (outer[0], outer[-1])}.values():
+            region = _raised(leg.region(shape), z_back <= top) & crop.mask
+            boards.append(Board(region, (axes.around(sheet.back, width), level_slab(-np.inf, top))))
+    return [board for board in boards if board.region.any()]
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """What lies above the front legs: an apron over them, a seat or table top to the depth ``edge``, m, and beyond it
+    an upright back. back: depth of that, or of the hind legs."""
+
+    apron: Mask
+    seat: Mask
+    beyond: Mask
+    back: float
+    edge: float
+
+    def boards(self, stance: _Stance, top: float) -> list[Board]:
+        """Return the boards of the three; top: height of the seat, m."""
+        axes, front, width, half = stance.axes, stance.front, stance.width, stance.width / 2.0
+        return [
+            Board(self.apron, (axes.around(front, width), level_slab(-np.inf, top))),
+            Board(self.seat, (level_slab(top - width, top), axes.slab(front - half, self.edge + half))),
+            Board(self.beyond, (axes.around(self.back, width), level_slab(top - width, np.inf))),
+        ]
+
+
+def _sheet(
+    camera: Camera, rays: Points, sheet: Mask, z_front: Points, stance: _Stance, hind: list[float], top: float
+) -> _Sheet:
+    """The ``sheet`` above the legs in its parts. z_front: heights (h, w) on the plane of the front legs, m; hind:
+    depths of the hind legs that are seen; top: height of the seat."""
+    axes, front, span, half = stance.axes, stance.front, stance.span, stance.width / 2.0
     apron = sheet & (z_front <= top)
-    on_top = _reach_on(camera, rays, frame, top).reshape(shape)
+    on_top = axes.reach_on(camera, rays, top).reshape(sheet.shape)
     back = float(np.median(hind)) if hind else front + USUAL_DEPTH * span
     beyond = sheet & ~apron & (on_top > back + half)
-    rise = float(_height_on(camera, rays, frame, back).reshape(shape)[beyond].max()) - top if beyond.any() else 0.0
+    rise = float(axes.heights_on(camera, rays, back).reshape(sheet.shape)[beyond].max()) - top if beyond.any() else 0.0
     edge = back
     if (sheet & ~apron).any() and rise < LOW_BACK * top:
         # No back: the far edge of a table top, which overhangs its legs.
@@ -290,26 +305,22 @@ def _standing(camera: Camera, crop: Crop, legs: list[Leg]) -> list[Board] | None
     if not hind:
         back = min(back, edge - half)
     back = max(back, front + 3.0 * half)
-    edge = max(edge, back)
-    upright = [(part, depth) for part, depth in parts if part.any()]
-    z_of = {depth: _height_on(camera, rays, frame, depth).reshape(shape) for _, depth in upright}
+    return _Sheet(apron, (sheet & ~beyond) | apron, beyond, back, max(edge, back))
+
+
+def _upright_boards(
+    camera: Camera, crop: Crop, rays: Points, stance: _Stance, parts: list[tuple[Mask, float]], top: float
+) -> list[Board]:
+    """The boards of legs and rungs ``parts``, each a region and its depth, up to the height ``top``."""
     boards = []
-    for part, depth in upright:
+    for part, depth in parts:
+        if not part.any():
+            continue
         # The seat's front edge hides the upper ends of the legs behind it.
-        region = part if depth < front + half else _raised(part, z_of[depth] <= top) & crop.mask
-        boards.append(Board(region, (frame.slab(depth - half, depth + half), _level(-np.inf, top))))
-    boards.append(Board(apron, (frame.slab(front - half, front + half), _level(-np.inf, top))))
-    seat = (sheet & ~beyond) | apron
-    boards.append(Board(seat, (_level(top - width, top), frame.slab(front - half, edge + half))))
-    boards.append(Board(beyond, (frame.slab(back - half, back + half), _level(top - width, np.inf))))
-    if len(hind) < 2:
-        # Hind legs are hidden behind the outer front legs.
-        z_back = _height_on(camera, rays, frame, back).reshape(shape)
-        outer = [leg for leg, first in zip(legs, is_front, strict=True) if first]
-        for leg in {id(item): item for item in (outer[0], outer[-1])}.values():
-            region = _raised(leg.region(shape), z_back <= top) & crop.mask
-            boards.append(Board(region, (frame.slab(back - half, back + half), _level(-np.inf, top))))
-    return [board for board in boards if board.region.any()]
+        z = stance.axes.heights_on(camera, rays, depth).reshape(part.shape)
+        region = part if depth < stance.front + stance.width / 2.0 else _raised(part, z <= top) & crop.mask
+        boards.append(Board(region, (stance.axes.around(depth, stance.width), level_slab(-np.inf, top))))
+    return boards
 
 
 def _raised(part: Mask, below: Mask) -> Mask:
@@ -326,7 +337,7 @@ def _raised(part: Mask, below: Mask) -> Mask:
 def _below(
     camera: Camera,
     crop: Crop,
-    frame: _Frame,
+    axes: GroundAxes,
     below: Mask,
     legs: list[Leg],
     front: float,
@@ -340,106 +351,11 @@ def _below(
         rows = np.arange(window[0].start, window[0].stop)
         wide = window[1].stop - window[1].start
         lowest = np.array([crop.left + float(np.flatnonzero(part[rows[-1]]).mean()) + 0.5, crop.top + rows[-1] + 1.0])
-        depth = float(frame.v(on_ground(camera, lowest)))
+        depth = float(axes.v(on_ground(camera, lowest)))
         rung = wide > 2.0 * len(rows)
         if not np.isfinite(depth) or rung or depth > front + 2.0 * span or part.sum() < 12:
             nearest = min(legs, key=lambda leg: abs(float(_photo(crop, leg)[0]) - lowest[0]))
-            depth = float(frame.v(on_ground(camera, _photo(crop, nearest))))
+            depth = float(axes.v(on_ground(camera, _photo(crop, nearest))))
             depth = front if depth < front + 0.3 * span or rung else depth
         found.append((part, max(depth, front)))
     return found
-
-
-def _height_on(camera: Camera, rays: Points, frame: _Frame, v: float) -> Points:
-    """Heights (n) at which ``rays`` (n, 3) meet the upright plane at ``v``."""
-    facing = np.maximum(rays[:, :2] @ frame.away, 1e-3)
-    depth = (v - float(frame.v(camera.position))) / facing
-    return np.asarray(camera.position[2] + depth * rays[:, 2])
-
-
-def _reach_on(camera: Camera, rays: Points, frame: _Frame, height: float) -> Points:
-    """Distances ``v`` (n) at which ``rays`` (n, 3) meet the level plane at ``height``; inf if they do not."""
-    down = -rays[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(down > 1e-9, (camera.position[2] - height) / np.maximum(down, 1e-12), np.inf)
-        found = float(frame.v(camera.position)) + depth * (rays[:, :2] @ frame.away)
-    return np.asarray(np.where(np.isfinite(depth), found, np.inf))
-
-
-Faces = NDArray[np.int64]
-MARGIN_PX = 6.0
-"""Depth of the grid before and behind the boards."""
-FOOT_PX = 2.0
-"""Height over the ground in pixels of what stands on it: outlines of feet are no better known."""
-FINEST_SHARE = 0.25
-"""Smallest step in depth over the step in the photo's plane."""
-
-
-class BoardField(RayField):
-    """φ of the union of boards, in pixels. t: pixels behind the depth of their middle."""
-
-    def __init__(self, camera: Camera, crop: Crop, boards: Sequence[Board]) -> None:
-        self._camera, self._crop, self._boards = camera, crop, boards
-        self._regions = [np.minimum(crop.distance, signed_distance(board.region) + OVERLAP_PX) for board in boards]
-        low, high = np.inf, -np.inf
-        rays = camera.rays(crop.pixels())
-        ground = ground_depth(camera, rays)
-        for board in boards:
-            inside = board.region.ravel()
-            slab = board.slabs[0]
-            facing = rays[inside] @ slab.normal
-            facing = np.where(np.abs(facing) < 1e-3, np.copysign(1e-3, facing), facing)
-            ends = np.stack([(side - camera.position @ slab.normal) / facing for side in (slab.low, slab.high)])
-            ends = np.minimum(ends, ground[inside])
-            ends = ends[:, np.isfinite(ends).all(axis=0) & (ends > 0).all(axis=0)]
-            if ends.size:
-                low, high = min(low, float(ends.min())), max(high, float(np.quantile(ends.max(axis=0), 0.999)))
-        self._middle = (low + high) / 2.0
-        self.unit = self._middle / camera.fx
-        self._range = ((low - self._middle) / self.unit - MARGIN_PX, (high - self._middle) / self.unit + MARGIN_PX)
-        self.thinnest = min((slab.high - slab.low) / self.unit for board in boards for slab in board.slabs)
-
-    def sample(self, points: Points) -> tuple[Points, Points]:
-        """Return boards and ground (n), (n) at ``points`` (n, 3), in pixels."""
-        at, world = points[:, 1::-1].T, self.world(points[:, :2], points[:, 2])
-        best = np.full(len(points), -np.inf)
-        for board, region in zip(self._boards, self._regions, strict=True):
-            inside = np.full(len(points), np.inf)
-            for slab in board.slabs:
-                along = world @ slab.normal
-                inside = np.minimum(inside, np.minimum(along - slab.low, slab.high - along) / self.unit)
-            near = inside > best
-            if near.any():
-                cut = ndimage.map_coordinates(region, at[:, near], order=1, mode="nearest")
-                best[near] = np.maximum(best[near], np.minimum(inside[near], cut))
-        return best, world[:, 2] / self.unit
-
-    def value(self, points: Points) -> Points:
-        """Return φ (n,) at ``points`` (n, 3)."""
-        body, ground = self.sample(points)
-        return np.minimum(body, ground)
-
-    def grid(self, spacing: float) -> tuple[NDArray[np.float32], Points, Points]:
-        """Return φ on a grid (x, y, t), its first corner (3,) and its steps (3,)."""
-        height, width = self._crop.mask.shape
-        steps = np.array([spacing, spacing, max(min(spacing, self.thinnest / 3.0), FINEST_SHARE * spacing)])
-        low, high = self._range
-        first = np.array([0.25, 0.25, low])
-        counts = (int((width - 1) // spacing) + 1, int((height - 1) // spacing) + 1, int((high - low) // steps[2]) + 2)
-        return self.sampled(first, steps, counts), first, steps
-
-
-def furniture_mesh(camera: Camera, crop: Crop, boards: Sequence[Board], target: int) -> tuple[BodyMesh, float]:
-    """Return the closed surface of ``boards`` with the outline of ``crop``, about ``target`` vertices, on the ground.
-
-    Also the share of it that was disconnected and removed. Raises InputError when the outline is too thin for a closed
-    surface.
-    """
-    field = BoardField(camera, crop, boards)
-    points, faces, lost = surface_of_size(field, float(crop.mask.sum()), target)
-    points = relax(field, points, faces)
-    pixels, depth, ground = field.depths(points)
-    # Feet that end within a pixel or two of the ground stand on it.
-    height = camera.position[2] + depth * camera.rays(pixels)[:, 2]
-    depth = np.where(height < FOOT_PX * field.unit, ground, np.minimum(depth, ground))
-    return standing_mesh(camera, pixels, depth, faces), lost
