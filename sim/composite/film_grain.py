@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..robust_deviation import MEDIAN_TO_DEVIATION
 from .srgb import Linear, linear_to_srgb, srgb_to_linear
 
 SIGMAS = (0.8, 1.6, 3.2)
@@ -44,7 +45,6 @@ LEAST = 0.6
 """Grain below this, in steps, is rounding and compression of a clean image."""
 WINDOWS = (11, 15, 23)
 """Window sizes in pixels for measuring a frame's own grain, per octave."""
-MEDIAN_TO_SIGMA = 1.4826
 ROUNDS = 12
 """Iterations of fitting the octaves' strengths, to within a percent."""
 QUANTUM = 60.0
@@ -206,7 +206,7 @@ def _local_sigma(band: NDArray[np.float32], wanted: NDArray[np.float32], window:
     relative = np.asarray(np.abs(band) / np.maximum(wanted, 1e-3) * QUANTUM)
     median = cv2.medianBlur(np.clip(np.rint(relative), 0, 255).astype(np.uint8), window)
     smooth = cv2.GaussianBlur(median.astype(np.float32), (0, 0), window / 4)
-    return np.asarray(smooth * (MEDIAN_TO_SIGMA / QUANTUM) * wanted)
+    return np.asarray(smooth * (MEDIAN_TO_DEVIATION / QUANTUM) * wanted)
 
 
 def _octaves(planes: Planes) -> tuple[list[Planes], Planes]:

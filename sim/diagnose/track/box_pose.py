@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...robust_deviation import robust_deviation
 from .pose_estimation import Array
 
 DIRECTIONS = 48
@@ -131,7 +132,7 @@ def standing_out(values: Array) -> Array:
     median of their neighbours."""
     near = [np.median(values[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1]) for k in range(len(values))]
     off = values - np.array(near)
-    return off / max(1.4826 * float(np.median(np.abs(off))), LEAST_OUT_PX)
+    return off / max(float(robust_deviation(off)), LEAST_OUT_PX)
 
 
 def repeats_after(edges: Array) -> float:

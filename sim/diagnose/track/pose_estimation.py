@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...rigid_alignment import nearest_rotation
+from ...robust_deviation import robust_deviation
 from ..capture import Camera
 
 Array = NDArray[np.float64]
@@ -127,7 +128,7 @@ def _refined(
         if not np.isfinite(residual).all():
             return None
         distance = np.linalg.norm(residual, axis=1)
-        scale = max(1.4826 * float(np.median(distance)) / 1.1774, 1e-3)
+        scale = max(float(robust_deviation(distance)) / 1.1774, 1e-3)
         step = _step(camera, rest, pose, residual, 1.0 / np.maximum(distance / (HUBER * scale), 1.0) ** 2)
         if step is None:
             return None
@@ -191,7 +192,7 @@ def pose_scatter(residual: Array) -> float | None:
         return None
     values = residual[rows][seen[rows]]
     share = (2 * per_frame[rows] - 6).sum() / (2 * per_frame[rows]).sum()
-    return 1.4826 * float(np.median(np.abs(values))) / float(np.sqrt(share))
+    return float(robust_deviation(values)) / float(np.sqrt(share))
 
 
 MOVING_PX = 0.5
@@ -244,7 +245,7 @@ def jitter(residual: Array) -> float | None:
         return None
     differences = np.diff(residual, n=3, axis=0)
     values = differences[np.isfinite(differences)]
-    return None if len(values) < 20 else 1.4826 * float(np.median(np.abs(values))) / float(np.sqrt(20.0))
+    return None if len(values) < 20 else float(robust_deviation(values)) / float(np.sqrt(20.0))
 
 
 _PAIRS_AT_ONCE = 1_000_000

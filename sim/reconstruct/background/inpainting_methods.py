@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite.inpaint import FillOptions, inpaint_once
+from ...robust_deviation import robust_deviation
 from ...scene.model import Camera
 from .relit_ground import near_any, smoothed
 from .stretch_inpainting import fill_stretches, is_even
@@ -109,7 +110,7 @@ def _with_grain(picture: Picture, hole: Mask, known: Mask, side: float, blur: fl
     smooth = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur), dtype=np.float32)
     detail = picture - smooth
     light = detail[inner].mean(axis=-1)
-    grain = 1.4826 * np.median(np.abs(light))
+    grain = robust_deviation(light)
     share = float(np.clip((grain / max(float(light.std()), 1e-3) - GRAINY[0]) / (GRAINY[1] - GRAINY[0]), 0.0, 1.0))
     # Beside several surfaces, such as grass with a tree behind it, the bark would be seen in the grass.
     if share == 0.0 or not is_even(picture, known, side, float(light.std())):

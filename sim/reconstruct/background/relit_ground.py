@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
 
+from ...robust_deviation import robust_deviation
 from .piecewise_light import piecewise_smooth
 from .surface_inpainting import AXES, light_field, logarithms
 from .texture_prediction import predict_texture
@@ -245,7 +246,7 @@ def _lack(cells: _Cells, changed: Mask | None) -> tuple[Picture, Mask]:
     lack = np.asarray(cv2.GaussianBlur(chosen, (0, 0), 1.0))
     axes = pattern @ AXES.T
     own = axes - level @ AXES.T + lack
-    strange = np.abs(own) > STRANGE * np.maximum(_spread((axes - usual)[around]), 2.0 * LEAST)
+    strange = np.abs(own) > STRANGE * np.maximum(_deviations((axes - usual)[around]), 2.0 * LEAST)
     strange[..., 1:] |= np.abs(lack[..., 1:]) > TINT * np.abs(lack[..., :1]) + TINTED
     trusted = ~strange.any(axis=-1) & (np.abs(lack[..., 0]) < DEEPEST) & ~cells.core & ~sudden
     told = trusted & cells.hole
@@ -300,6 +301,6 @@ def _steps(difference: Picture, cells: _Cells) -> Picture:
     return result
 
 
-def _spread(values: Picture) -> Picture:
-    """Robust standard deviation (c,) of ``values`` (n, c)."""
-    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0), dtype=np.float32)
+def _deviations(values: Picture) -> Picture:
+    """Robust standard deviations (c,) of ``values`` (n, c) about their medians."""
+    return np.asarray(robust_deviation(values - np.median(values, axis=0), axis=0), dtype=np.float32)

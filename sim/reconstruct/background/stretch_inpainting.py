@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite.inpaint import FillOptions
+from ...robust_deviation import robust_deviation
 from .relit_ground import smoothed
 from .surface_inpainting import clamp_to_surroundings, fill_surface, logarithms
 from .texture_prediction import Stretch, stretches
@@ -60,7 +61,7 @@ def is_irregular(picture: Picture, hole: Mask, barred: Mask) -> bool:
         return False
     detail = (logs - smoothed(logs, known, fine)).mean(axis=-1)[inner]
     spread = float(detail.std())
-    grain = 1.4826 * float(np.median(np.abs(detail - np.median(detail))))
+    grain = float(robust_deviation(detail - np.median(detail)))
     finest = float((logs - smoothed(logs, known, max(1.0, FINEST * side))).mean(axis=-1)[inner].std())
     return grain > GRAINY * spread and finest > SHARP * spread and is_even(logs, known, side, spread)
 

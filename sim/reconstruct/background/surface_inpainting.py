@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from ...composite.inpaint import FillOptions, inpaint_once
+from ...robust_deviation import robust_deviation
 from .texture_prediction import predict_texture, stretches
 
 Mask = NDArray[np.bool_]
@@ -240,7 +241,7 @@ def _balanced(pattern: Picture, mean: Picture, rest: Picture, known: Mask, hole:
             given = min(1.0, float(np.sqrt(missing / max(float(given[filled].var()), 1e-12)))) * given
             if 2.0**level <= GRAIN * side:
                 # Use medians: edges and single spots add variance, but are not grain.
-                grain, has = _spread(own[seen]), _spread((predicted + given)[filled])
+                grain, has = _deviations(own[seen]), _deviations((predicted + given)[filled])
                 share = np.sqrt(np.maximum(1.0 - np.square(has / np.maximum(grain, 1e-6)), 0.0))
                 share = share * np.clip((grain / np.maximum(own[seen].std(axis=0), 1e-6) - 0.5) / 0.3, 0.0, 1.0)
                 given = given + share * np.clip(donor, -3.0 * grain, 3.0 * grain)
@@ -252,9 +253,9 @@ def _balanced(pattern: Picture, mean: Picture, rest: Picture, known: Mask, hole:
     return total
 
 
-def _spread(values: Picture) -> Picture:
-    """Robust standard deviation (c,) of ``values`` (n, c) of mean 0."""
-    return np.asarray(1.4826 * np.median(np.abs(values[:: max(1, len(values) // 20_000)]), axis=0), dtype=np.float32)
+def _deviations(values: Picture) -> Picture:
+    """Robust standard deviations (c,) of ``values`` (n, c) about 0, by a sample of them."""
+    return np.asarray(robust_deviation(values[:: max(1, len(values) // 20_000)], axis=0), dtype=np.float32)
 
 
 def _donor(pattern: Picture, known: Mask, hole: Mask) -> Picture:
@@ -262,7 +263,7 @@ def _donor(pattern: Picture, known: Mask, hole: Mask) -> Picture:
     none."""
     # Clip single spots, or they would be copied as ghosts.
     middle = np.median(pattern[known][:: max(1, int(known.sum()) // 20_000)], axis=0)
-    most = 3.0 * _spread(pattern[known] - middle)
+    most = 3.0 * _deviations(pattern[known] - middle)
     pattern = np.clip(pattern, middle - most, middle + most)
     result = np.where(known[..., None], pattern, 0.0).astype(np.float32)
     for stretch in stretches(hole, known, most=DONORS):

@@ -92,12 +92,20 @@ def stands_below(camera: Camera, contact: NDArray[np.floating]) -> bool:
     return float(declination(camera, contact)) >= math.radians(MIN_DECLINATION_DEG * 0.5)
 
 
+def depth_below(height: float, descent: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the depth (...) along the optical axis at which rays meet a plane ``height`` below the camera; inf if
+    they do not.
+
+    descent: (...) of rays of unit depth toward the plane, along its normal.
+    """
+    with np.errstate(divide="ignore"):
+        return np.where(descent > 1e-9, height / np.maximum(descent, 1e-12), np.inf)
+
+
 def ground_depth(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the depth (...) along the optical axis at which ``rays`` (..., 3) of unit depth meet z = 0; inf if they do
     not."""
-    down = -rays[..., 2]
-    with np.errstate(divide="ignore"):
-        return np.where(down > 1e-9, camera.position[2] / np.maximum(down, 1e-12), np.inf)
+    return depth_below(float(camera.position[2]), -rays[..., 2])
 
 
 def on_ground(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..background.surface_edges import Edge, edges_behind
 from ..background.surface_inpainting import logarithms
-from ..camera.ground_camera import on_ground
+from ..camera.ground_camera import depth_below, on_ground
 
 Mask = NDArray[np.bool_]
 Values = NDArray[np.float64]
@@ -40,12 +40,13 @@ class ShadowPlane:
         """Return the points (..., 3) in the plane's frame at ``pixels`` (..., 2) of the photo; inf where a ray does not
         meet its front."""
         rays = camera.rays(pixels)
-        toward, height = rays @ self.axes[2], float((camera.position - self.origin) @ self.axes[2])
-        meets = (toward < -1e-9) & (height > 0.0)
-        depth = np.where(meets, height / np.maximum(-toward, 1e-12), np.inf)
+        height = float((camera.position - self.origin) @ self.axes[2])
+        if height <= 0.0:
+            return np.full(rays.shape, np.inf)
+        depth = depth_below(height, -rays @ self.axes[2])[..., None]
         with np.errstate(invalid="ignore"):
-            found = self.in_frame(camera.position + depth[..., None] * rays)
-        return np.where(meets[..., None], found, np.inf)
+            found = self.in_frame(camera.position + depth * rays)
+        return np.where(np.isfinite(depth), found, np.inf)
 
     def in_frame(self, points: Values) -> Values:
         """Return world ``points`` (..., 3) in the plane's frame."""

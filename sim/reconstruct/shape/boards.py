@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...scene.model import Camera
-from ..camera.ground_camera import ground_depth
+from ..camera.ground_camera import depth_below, ground_depth
 from .inflate import Crop, signed_distance
 from .inflated_mesh import BodyMesh, standing_mesh
 from .surface_mesh import RayField, relax, surface_of_size
@@ -82,9 +82,8 @@ class GroundAxes:
 
     def reach_on(self, camera: Camera, rays: Points, height: float) -> Points:
         """Return the v (n) at which ``rays`` (n, 3) meet the level plane at ``height``; inf if they do not."""
-        down = -rays[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.where(down > 1e-9, (camera.position[2] - height) / np.maximum(down, 1e-12), np.inf)
+        depth = depth_below(float(camera.position[2] - height), -rays[:, 2])
+        with np.errstate(invalid="ignore"):
             found = float(self.v(camera.position)) + depth * (rays[:, :2] @ self.away)
         return np.asarray(np.where(np.isfinite(depth), found, np.inf))
 

@@ -20,6 +20,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ...composite.srgb import bytes_to_linear
+from ...robust_deviation import robust_deviation
 from ...scene.model import Camera
 from ...smoothstep import smoothstep
 from ..mesh_raster import rasterise
@@ -180,7 +181,7 @@ def _fitted(basis: Points, logs: Points) -> tuple[Points, float]:
         matrix = (offset * weights[:, None]).T @ offset + np.diag(ridge)
         found = np.linalg.solve(matrix, (offset * weights[:, None]).T @ (logs - level))
         residual = (logs - level - offset @ found).mean(axis=1)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        spread = max(float(robust_deviation(residual)), 1e-3)
         weights = 1.0 / np.maximum(1.0, np.abs(residual) / (1.5 * spread))
     light = (logs - level).mean(axis=1)
     left = float((weights * residual**2).sum() / max(float((weights * light**2).sum()), 1e-12))

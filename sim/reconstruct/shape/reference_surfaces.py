@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ...robust_deviation import robust_deviation
 from ...scene.model import Camera
 from ..camera.depth_map import DepthMap
 from ..camera.ground_camera import ground_depth, on_ground
@@ -100,7 +101,7 @@ def _line(truth: Field, values: Field, *, with_shift: bool) -> tuple[float, floa
         else:
             slope = float((weights * truth * values).sum()) / max(float((weights * truth**2).sum()), 1e-30)
         residual = values - slope * truth - shift
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-12 * float(np.abs(values).max()) + 1e-300)
+        scale = max(float(robust_deviation(residual)), 1e-12 * float(np.abs(values).max()) + 1e-300)
         weights = np.clip(1.0 - (residual / (4.7 * scale)) ** 2, 0.0, 1.0) ** 2
         if weights.sum() <= 0:
             break
