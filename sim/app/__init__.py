@@ -26,7 +26,8 @@ scene_to_world.py      scene → engine's world: scene_bodies.py bodies, scene_c
 preview_server.py      the live preview's worker; preview_simulation.py its coarse runs
 diagnose.py            capture → diagnosis; explain.py video → diagnosis
 import_capture.py      recordings of other programs → capture
-export_usd.py          scene and bake → USD, usd_particles.py its matter; export_patch.py a diagnosis → MJCF or USD
+export_usd.py          scene and bake → USD: usd_motion.py what moves, usd_particles.py matter
+export_patch.py        a diagnosis → MJCF or USD
 evaluate.py            how real a video is
 stage_process.py       a stage in a process of its own; bake_worker.py, launch.py what runs there
 requirements.py        packages that simulating needs; install_worker.py makes an environment with them

@@ -19,28 +19,25 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing, write_bytes
 from ..cache.bake_check import unchanged_bake
-from ..cache.bake_folder import MESH_SPACE, Bake, BakedObject
+from ..cache.bake_folder import Bake, BakedObject
 from ..cache.folder_lock import lock_beside
-from ..cache.pc2 import Pc2Reader
-from ..errors import Cancelled, InputError
+from ..errors import InputError
 from ..events import IsCancelled, never
 from ..files import is_file, shown
 from ..memory import ran_out
 from ..mpm.surface_contact import SurfaceContact
-from ..rigid_alignment import nearest_pose
 from ..scene.folder import SCENE_FILE, Scene, unchanged_scene
 from ..scene.scene_object import SceneObject
 from ..scene.shading import evenly_lit_mesh
 from ..scene.textured_mesh import TexturedMesh
 from .export_patch import prim_name
-from .scene_bodies import mass_of
+from .scene_bodies import Mass, mass_of
 from .scene_contacts import surface
+from .usd_motion import UsdMotion, UsdObject, extent, quaternion, vectors
 from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
 
 Array = NDArray[np.float64]
 ENDINGS = (".usda", ".usdc")
-RIGID_FIT = 1e-4
-"""Farthest that a vertex of a rigid body may be from the fitted pose, over its size; beyond it, points are written."""
 FOCAL_LENGTH = 35.0
 """Of the camera, tenths of a unit: only its ratio to the aperture counts."""
 PICTURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
@@ -189,7 +186,7 @@ class _Writer:
         xform = UsdGeom.Xformable(prim)
         moved, turned = xform.AddTranslateOp(), xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
         moved.Set(Gf.Vec3d(*map(float, matrix[:3, 3])))
-        turned.Set(_quaternion(matrix[:3, :3]))
+        turned.Set(quaternion(matrix[:3, :3]))
         return moved, turned
 
     def _ground(self, point: Sequence[float], normal: Sequence[float]) -> None:
@@ -233,16 +230,7 @@ class _Writer:
         world = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         faces = mesh.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else mesh.faces
         rigid = item.role == "dynamic" and item.material.law == "rigid"
-        mass = None
-        if item.role == "dynamic":
-            thickness = None
-            if not item.fill:
-                thickness = item.shell_thickness
-                if thickness is None:
-                    self.notes.append(
-                        f"{item.name} is hollow without a shell_thickness: its mass is that of a full one"
-                    )
-            mass = mass_of(item, world, faces, thickness=thickness)
+        mass = self._mass(item, world, faces) if item.role == "dynamic" else None
         centre = mass.centre if rigid and mass is not None else np.zeros(3)
         name = self._name(item.name)
         body = UsdGeom.Xform.Define(self.stage, f"/World/{name}")
@@ -268,13 +256,21 @@ class _Writer:
             api.CreateMassAttr(mass.mass)
             api.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, mass.centre - centre)))
             api.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, mass.inertia)))
-            api.CreatePrincipalAxesAttr(Gf.Quatf(_quaternion(mass.axes)))
+            api.CreatePrincipalAxesAttr(Gf.Quatf(quaternion(mass.axes)))
         material = self._material(name, surface(item, self.ground), item, mesh)
         self._bind(shape, material)
         if not rigid:
             self._matter(index, name, item, material)
         if self.bake is not None and baked is not None:
-            self._motion(name, baked, matrix, world, centre, shape, operations if rigid else None)
+            placed = UsdObject(f"/World/{name}", shape, world, centre, operations)
+            self.notes += UsdMotion(self.bake, baked, matrix, self.cancelled).write(self.stage, placed, rigid=rigid)
+
+    def _mass(self, item: SceneObject, world: Array, faces: NDArray[np.int64]) -> Mass:
+        """Mass of ``item``, whose mesh has the vertices ``world`` (V, 3) in world metres."""
+        thickness = None if item.fill else item.shell_thickness
+        if not item.fill and thickness is None:
+            self.notes.append(f"{item.name} is hollow without a shell_thickness: its mass is that of a full one")
+        return mass_of(item, world, faces, thickness=thickness)
 
     def _matter(self, index: int, name: str, item: SceneObject, bound: Any) -> None:
         """Write what UsdPhysics has no schema for: as custom data, and as particles of Newton's schema."""
@@ -296,18 +292,18 @@ class _Writer:
         from pxr import Sdf, UsdGeom, Vt
 
         made = UsdGeom.Mesh.Define(self.stage, path)
-        made.CreatePointsAttr(_vectors(points))
+        made.CreatePointsAttr(vectors(points))
         made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
         made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).ravel()))
         made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        made.CreateExtentAttr(_vectors(np.stack([points.min(axis=0), points.max(axis=0)])))
+        made.CreateExtentAttr(extent(points))
         values = UsdGeom.PrimvarsAPI(made)
         if mesh.uv is not None:
             kind = Sdf.ValueTypeNames.TexCoord2fArray
             found = Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uv, np.float32))
             values.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex).Set(found)
         if mesh.colours is not None:
-            made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(mesh.colours))
+            made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vectors(mesh.colours))
         return made.GetPrim()
 
     def _material(self, name: str, contact: SurfaceContact, item: SceneObject | None, mesh: TexturedMesh | None) -> Any:
@@ -350,86 +346,6 @@ class _Writer:
         api = UsdShade.MaterialBindingAPI.Apply(prim)
         api.Bind(material)
         api.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
-
-    def _motion(
-        self, name: str, baked: BakedObject, matrix: Array, world: Array, centre: Array, shape: Any, pose: Any
-    ) -> None:
-        """Write the samples of one object: as poses of ``pose``, where it moves rigidly, else as points."""
-        from pxr import Gf, UsdGeom, Vt
-
-        assert self.bake is not None
-        turn = matrix if baked.space == MESH_SPACE else np.eye(4)
-        first, count = self.bake.manifest.frame_start, self.bake.manifest.frames_done
-
-        def samples(file: str) -> Any:
-            reader = Pc2Reader(self.bake.root / file)  # type: ignore[union-attr]
-            for index in range(count):
-                if self.cancelled():
-                    raise Cancelled("export cancelled; nothing was written")
-                yield first + index, reader.sample(index) @ turn[:3, :3].T + turn[:3, 3]
-
-        size = max(float(np.ptp(world, axis=0).max()), 1e-9)
-        if pose is not None:
-            rest, poses, error = world - centre, [], 0.0
-            for frame, points in samples(baked.file):
-                rotation, shift = nearest_pose(rest, points)
-                error = max(error, float(np.linalg.norm(rest @ rotation.T + shift - points, axis=1).max()))
-                poses.append((frame, rotation, shift))
-            if error < RIGID_FIT * size:
-                before = None
-                for frame, rotation, shift in poses:
-                    turned = _quaternion(rotation)
-                    # Of q and -q the one that is nearer: readers interpolate component by component.
-                    if before is not None and Gf.Dot(before, turned) < 0:
-                        turned = -turned
-                    before = turned
-                    pose[0].Set(Gf.Vec3d(*map(float, shift)), frame)
-                    pose[1].Set(turned, frame)
-                return
-            self.notes.append(f"{name} does not stay rigid in the bake: its points were written")
-        mesh = UsdGeom.Mesh(shape)
-        for frame, points in samples(baked.file):
-            local = points - centre
-            mesh.GetPointsAttr().Set(_vectors(local), frame)
-            mesh.GetExtentAttr().Set(_vectors(np.stack([local.min(axis=0), local.max(axis=0)])), frame)
-        if baked.points_file is not None:
-            cloud = UsdGeom.Points.Define(self.stage, f"/World/{name}/particles")
-            found = None
-            for frame, points in samples(baked.points_file):
-                found = points if found is None else found
-                cloud.GetPointsAttr().Set(_vectors(points), frame)
-                cloud.GetExtentAttr().Set(_vectors(np.stack([points.min(axis=0), points.max(axis=0)])), frame)
-            assert found is not None
-            cloud.GetPointsAttr().Set(_vectors(found))
-            width = 2 * (3 * _volume(world, shape) / (4 * math.pi * len(found))) ** (1 / 3)
-            cloud.CreateWidthsAttr(Vt.FloatArray([width]))
-            cloud.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        if baked.splats:
-            self.notes.append(f"the splats of {name} are not written")
-        if baked.torn_file is not None:
-            self.notes.append(f"{name} tears in the bake: the skin before the crack is written, as it stretches")
-
-
-def _volume(world: Array, shape: Any) -> float:
-    from pxr import UsdGeom
-
-    faces = np.asarray(UsdGeom.Mesh(shape).GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-    a, b, c = (world[faces[:, i]] for i in range(3))
-    return max(abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6, 1e-12)
-
-
-def _vectors(points: Array) -> Any:
-    from pxr import Vt
-
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
-
-
-def _quaternion(rotation: Array) -> Any:
-    from pxr import Gf
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = map(float, Rotation.from_matrix(rotation).as_quat())
-    return Gf.Quatd(w, x, y, z)
 
 
 def require_scene(folder: Path) -> None:

@@ -114,7 +114,7 @@ def _require_bounded(content: bytes, path: Path) -> None:
     """Raise InputError for a glTF that unpacks to more than ``MAX_UNPACKED_BYTES``, before trimesh does it.
 
     What is no glTF is left to trimesh, which says so. Its description is the first part of a GLB, as trimesh takes it,
-    and not the first of the right type, as ``textured_mesh.glb_chunks`` does.
+    and not the first of the right type, as ``glb.glb_chunks`` does.
     """
     if content[:4] == b"glTF" and len(content) >= _GLB.size:
         content = content[_GLB.size : _GLB.size + _GLB.unpack_from(content)[3]]

@@ -2,16 +2,14 @@
 """Textured meshes without an image library: read a GLB, and rewrite a mesh file with moved vertices.
 
 A GLB with one primitive, as reconstruction writes it, is read with numpy alone and keeps its image bytes. Any other
-mesh goes through ``read_mesh`` and loses its texture. Vertex order is that of ``read_mesh`` (glTF 2.0,
-registry.khronos.org/glTF). Rewriting keeps vertex count and order, faces and texture.
+mesh goes through ``read_mesh`` and loses its texture. Vertex order is that of ``read_mesh``. Rewriting keeps vertex
+count and order, faces and texture.
 """
 
 from __future__ import annotations
 
 import io
-import json
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,20 +20,21 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_bytes
 from ..errors import InputError
 from ..files import read_bytes
-from .meshes import MAX_MESH_BYTES, MAX_NODES, read_mesh
+from .glb import (
+    DAMAGED,
+    WIDTHS,
+    accessor_values,
+    glb_chunks,
+    glb_content,
+    listed_item,
+    only_primitive,
+    overwrite_accessor,
+    view_bytes,
+)
+from .meshes import MAX_MESH_BYTES, read_mesh
 
-MAX_JSON_BYTES = 16 * 2**20
+Array = NDArray[np.float64]
 PICTURES = ("image/png", "image/jpeg")
-_MAGIC, _JSON, _BINARY, _TRIANGLES = b"glTF", b"JSON", b"BIN\0", 4
-_COMPONENTS: dict[int, np.dtype[Any]] = {
-    5121: np.dtype("u1"),
-    5123: np.dtype("<u2"),
-    5125: np.dtype("<u4"),
-    5126: np.dtype("<f4"),
-}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_GARBAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error, RecursionError)
-"""Errors from following references in a damaged file."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +91,13 @@ def _read_glb(path: Path) -> TexturedMesh | None:
         raise InputError(f"{path}: {error.strerror or error}") from None
     try:
         return _parse(content)
-    except _GARBAGE as error:
+    except DAMAGED as error:
         raise InputError(f"{path}: not a readable mesh ({type(error).__name__}: {error}); export it again") from None
 
 
 def _parse(content: bytes) -> TexturedMesh | None:
     document, binary = glb_chunks(content)
-    found = _only_primitive(document)
+    found = only_primitive(document)
     if found is None:
         return None
     primitive, matrix = found
@@ -121,131 +120,12 @@ def _parse(content: bytes) -> TexturedMesh | None:
     return TexturedMesh(vertices=vertices, faces=faces, uv=uv, picture=picture, colours=colours)
 
 
-def _only_primitive(document: dict[str, Any]) -> tuple[dict[str, Any], NDArray[np.float64]] | None:
-    """Return the triangles of the file's one mesh, and their transform (4, 4); None for another number of parts."""
-    if document.get("extensionsRequired"):
-        return None
-    instances = mesh_instances(document)
-    if len(instances) != 1:
-        return None
-    index, matrix = instances[0]
-    primitives = listed_item(document, "meshes", index)["primitives"]
-    if len(primitives) != 1 or primitives[0].get("mode", _TRIANGLES) != _TRIANGLES:
-        return None
-    return primitives[0], matrix
-
-
-def glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return a GLB file's JSON and binary data. Raises ValueError, struct.error or KeyError if it is none."""
-    magic, version, _ = struct.unpack_from("<4sII", content, 0)
-    if magic != _MAGIC or version != 2:
-        raise ValueError("it is no binary glTF 2.0")
-    found: dict[bytes, bytes] = {}
-    offset = 12
-    while offset + 8 <= len(content):
-        length, kind = struct.unpack_from("<I4s", content, offset)
-        if offset + 8 + length > len(content):
-            raise ValueError("it is cut off")
-        found.setdefault(kind, content[offset + 8 : offset + 8 + length])
-        offset += 8 + length
-    if len(found[_JSON]) > MAX_JSON_BYTES:
-        raise ValueError("its description is too large")
-    document = json.loads(found[_JSON])
-    if not isinstance(document, dict):
-        raise ValueError("its description is no object")
-    return document, found.get(_BINARY, b"")
-
-
-def listed_item(document: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
-    """Return an entry of a list of the file; negative indices are refused."""
-    if isinstance(index, bool) or not isinstance(index, int) or index < 0:
-        raise ValueError(f"{kind}[{index!r}]")
-    found = document[kind][index]
-    if not isinstance(found, dict):
-        raise ValueError(f"{kind}[{index}] is no object")
-    return found
-
-
-def mesh_instances(document: dict[str, Any]) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return each mesh index of the file's scene with its transform (4, 4)."""
-    scene = listed_item(document, "scenes", document.get("scene", 0))
-    waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
-    found: list[tuple[int, NDArray[np.float64]]] = []
-    visits = 0
-    while waiting:
-        index, above = waiting.pop()
-        visits += 1
-        if visits > MAX_NODES:
-            raise ValueError("its nodes go in circles, or are too many")
-        node = listed_item(document, "nodes", index)
-        matrix = above @ _local(node)
-        if "mesh" in node:
-            found.append((node["mesh"], matrix))
-        waiting += [(child, matrix) for child in node.get("children", [])]
-    return found
-
-
-def _local(node: dict[str, Any]) -> NDArray[np.float64]:
-    if "matrix" in node:
-        matrix = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    else:
-        matrix = np.eye(4)
-        x, y, z, w = _numbers(node.get("rotation", (0, 0, 0, 1)), 4)
-        matrix[:3, :3] = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        ) * _numbers(node.get("scale", (1, 1, 1)), 3)
-        matrix[:3, 3] = _numbers(node.get("translation", (0, 0, 0)), 3)
-    if not np.isfinite(matrix).all():
-        raise ValueError("a node's place is not finite")
-    return matrix
-
-
-def _numbers(values: Any, count: int) -> NDArray[np.float64]:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != (count,):
-        raise ValueError(f"{count} numbers expected")
-    return array
-
-
-def _view(document: dict[str, Any], binary: bytes, index: Any) -> tuple[bytes, int]:
-    """Return the bytes of a buffer view, and its stride (0: packed)."""
-    view = listed_item(document, "bufferViews", index)
-    start, length, stride = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 0)
-    buffer = listed_item(document, "buffers", view["buffer"])
-    if "uri" in buffer or view["buffer"] != 0:
-        raise ValueError("it keeps its data in another file")
-    if min(start, length, stride) < 0 or start + length > len(binary):
-        raise ValueError("it names data beyond its end")
-    return binary[start : start + length], stride
-
-
-def accessor_values(document: dict[str, Any], binary: bytes, index: Any, width: int) -> NDArray[Any]:
-    """Return the values (count, width) of an accessor."""
-    accessor = listed_item(document, "accessors", index)
-    if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
-        raise ValueError(f"an accessor of {accessor['type']}")
-    dtype, count = _COMPONENTS[accessor["componentType"]], accessor["count"]
-    data, stride = _view(document, binary, accessor["bufferView"])
-    start, row = accessor.get("byteOffset", 0), width * dtype.itemsize
-    stride = stride or row
-    if start < 0 or count < 1 or stride < row or start + (count - 1) * stride + row > len(data):
-        raise ValueError("an accessor that reaches beyond its data")
-    values = np.ndarray((count, width), dtype, data, offset=start, strides=(stride, dtype.itemsize))
-    if accessor.get("normalized") and dtype.kind == "u":
-        return np.asarray(values / float(2 ** (8 * dtype.itemsize) - 1))
-    return values
-
-
 def _colours(
     document: dict[str, Any], binary: bytes, attributes: dict[str, Any], count: int
 ) -> NDArray[np.float64] | None:
     if "COLOR_0" not in attributes:
         return None
-    width = _WIDTHS[listed_item(document, "accessors", attributes["COLOR_0"])["type"]]
+    width = WIDTHS[listed_item(document, "accessors", attributes["COLOR_0"])["type"]]
     colours = accessor_values(document, binary, attributes["COLOR_0"], width).astype(np.float64)
     if width < 3 or len(colours) != count or not np.isfinite(colours).all():
         raise ValueError("colours that do not fit its vertices")
@@ -268,7 +148,7 @@ def _texture(
     uv = accessor_values(document, binary, primitive["attributes"]["TEXCOORD_0"], 2).astype(np.float64)
     if len(uv) != count or not np.isfinite(uv).all() or not math.isfinite(float(np.abs(uv).max())):
         raise ValueError("texture coordinates that do not fit its vertices")
-    return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]), _view(document, binary, image["bufferView"])[0]
+    return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]), view_bytes(document, binary, image["bufferView"])[0]
 
 
 def transformed(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -282,9 +162,6 @@ def transformed(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDA
     )
 
 
-Array = NDArray[np.float64]
-
-_FLOAT = 5126
 _PLY_START = b"ply\nformat binary_little_endian 1.0\n"
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -344,7 +221,7 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
     """Return the file's bytes, or None for an unsupported layout: several meshes, positions shared or not 32-bit."""
     try:
         document, binary = glb_chunks(content)
-        found = _only_primitive(document)
+        found = only_primitive(document)
         if found is None:
             return None
         primitive, matrix = found
@@ -359,39 +236,18 @@ def _glb_moved(content: bytes, vertices: Array, faces: NDArray[np.integer]) -> b
         if len(place) != len(vertices):
             return None
         local = transformed(vertices[first][place], np.linalg.inv(matrix))
-        if not _overwrite(document, buffer, attributes["POSITION"], local):
+        if not overwrite_accessor(document, buffer, attributes["POSITION"], local):
             return None
         accessor = listed_item(document, "accessors", attributes["POSITION"])
         written = local.astype("<f4").astype(np.float64)
         accessor["min"], accessor["max"] = written.min(axis=0).tolist(), written.max(axis=0).tolist()
         if "NORMAL" in attributes:
             turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
-            if not _overwrite(document, buffer, attributes["NORMAL"], _normals(local, turned, place)):
+            if not overwrite_accessor(document, buffer, attributes["NORMAL"], _normals(local, turned, place)):
                 return None
-    except _GARBAGE:
+    except DAMAGED:
         return None
-    text = json.dumps(document, ensure_ascii=False, allow_nan=False).encode("utf-8")
-    text += b" " * (-len(text) % 4)
-    data = bytes(buffer) + bytes(-len(buffer) % 4)
-    head = struct.pack("<4sII", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(data))
-    return head + struct.pack("<I4s", len(text), _JSON) + text + struct.pack("<I4s", len(data), _BINARY) + data
-
-
-def _overwrite(document: dict[str, Any], buffer: bytearray, index: Any, values: Array) -> bool:
-    """Overwrite an accessor's values with ``values`` (V, 3) in place; return whether its layout allowed it."""
-    accessor = listed_item(document, "accessors", index)
-    plain = accessor["componentType"] == _FLOAT and accessor["type"] == "VEC3" and "sparse" not in accessor
-    if not plain or accessor["count"] != len(values):
-        return False
-    view = listed_item(document, "bufferViews", accessor["bufferView"])
-    if view["buffer"] != 0 or "uri" in listed_item(document, "buffers", 0):
-        return False
-    stride = view.get("byteStride", 0) or 12
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    if start < 0 or stride < 12 or start + (len(values) - 1) * stride + 12 > len(buffer):
-        return False
-    np.ndarray((len(values), 3), "<f4", buffer, offset=start, strides=(stride, 4))[:] = values
-    return True
+    return glb_content(document, bytes(buffer))
 
 
 def _ply_moved(content: bytes, vertices: Array) -> bytes | None:

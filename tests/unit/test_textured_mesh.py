@@ -15,14 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.scene import textured_mesh
+from physgen.sim.scene.glb import accessor_values, glb_chunks
 from physgen.sim.scene.meshes import read_mesh
-from physgen.sim.scene.textured_mesh import (
-    accessor_values,
-    glb_chunks,
-    moved_suffix,
-    read_textured_mesh,
-    write_moved_mesh,
-)
+from physgen.sim.scene.textured_mesh import moved_suffix, read_textured_mesh, write_moved_mesh
 from PIL import Image
 
 
