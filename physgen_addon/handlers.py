@@ -12,7 +12,6 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import background_jobs, bake_state, blend_trust, paths
-from . import bake_state as unsaved
 from .context import redraw
 from .playback import point_caches
 from .playback.bake_record import BAKES
@@ -179,7 +178,7 @@ def _on_load(*_: Any) -> None:
     bake_state.forget()
     _settings.clear()
     paths.new_unsaved_key()
-    unsaved.forget_unsaved()
+    bake_state.forget_unsaved()
     for scene in bpy.data.scenes:
         _find_by_modifiers(scene)
     bake_state.mark_dirty()
@@ -220,7 +219,7 @@ def _find_by_modifiers(scene: bpy.types.Scene) -> None:
 def _before_save(path: str = "", *_: Any) -> None:
     # Empty for the start-up file.
     if path:
-        unsaved.before_first_save(path)
+        bake_state.before_first_save(path)
         remember_folders(path)
 
 
@@ -228,7 +227,7 @@ def _before_save(path: str = "", *_: Any) -> None:
 def _after_save(path: str = "", *_: Any) -> None:
     if path:
         restore_folders(path)
-        unsaved.after_first_save(path)
+        bake_state.after_first_save(path)
         blend_trust.note_saved()
         bake_state.mark_dirty()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators: explain a video, load a capture, diagnose it, add the effect that was found, compare two bakes."""
+"""Operators: explain a video, load a capture, diagnose it."""
 
 from __future__ import annotations
 
@@ -9,26 +9,20 @@ from pathlib import Path
 import bpy
 from mathutils import Vector
 
-from ...sim.app.add_effect import AddRequest, add_and_bake, found_effects, with_effects
 from ...sim.app.stage_process import run_stage
-from ...sim.cache.bake_folder import load_bake
 from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
 from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
-from ...sim.errors import InputError, PhysGenError
+from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.html import require_harmless
-from ...sim.scene.folder import Scene, load_scene
-from ...sim.validation import read_json
 from ..background_jobs import JobOperator, Work
 from ..context import look_through_camera, turn_to, viewports
 from ..interpreter import cli_command, find_python
-from ..paths import bake_folder, folder_beside, free_folder, require_file, require_folder, stored
+from ..paths import folder_beside, free_folder, require_file, require_folder, stored
 from ..playback import capture_scene, capture_view
-from ..playback import capture_view as overlay
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
-from ..props import diagnose_props as report_props
 from ..props.body_props import is_body
-from ..props.diagnose_props import apply_view
+from ..props.diagnose_props import apply_view, clear_diagnosis, fill_diagnosis
 from ..props.preferences import python
 from ..text import count, report_errors
 from .import_ops import hide_all
@@ -50,7 +44,7 @@ def report_folder(state: bpy.types.PropertyGroup) -> Path:
     return folder_beside(capture_folder(state.capture), "diagnosis")
 
 
-def _stored(final: Event, name: str) -> str:
+def stored_path(final: Event, name: str) -> str:
     """Return the path ``name`` of a job's last event as the scene stores it."""
     return stored(Path(str(final[name])))
 
@@ -78,9 +72,9 @@ def show_capture(scene: bpy.types.Scene, diagnosis: Path | None) -> Capture:
     if state.has_scores:
         state.most = max(arrays.most(capture), 1e-6)
     if report is not None:
-        report_props.fill_diagnosis(state, report)
+        fill_diagnosis(state, report)
     else:
-        report_props.clear_diagnosis(state)
+        clear_diagnosis(state)
     if fresh or had_motion != state.has_motion:
         _choose_layers(state, flat=capture.camera is not None and not state.has_motion)
         state.radius = 0.03 * max(float((o.vertices.max(0) - o.vertices.min(0)).max()) for o in capture.objects)
@@ -209,7 +203,7 @@ class PHYSGEN_OT_clear_capture(bpy.types.Operator):
         state.trials.clear()
         state.capture_warnings.clear()
         state.has_motion = state.has_scores = False
-        report_props.clear_diagnosis(state)
+        clear_diagnosis(state)
         return {"FINISHED"}
 
 
@@ -282,7 +276,7 @@ class PHYSGEN_OT_diagnose(JobOperator, bpy.types.Operator):
     def finished(self, scene: bpy.types.Scene, final: Event) -> str:
         """Show the result, also if undo has meanwhile removed the capture from the scene."""
         state, out = scene.physgen_diagnose, Path(str(final["out"]))
-        state.capture = _stored(final, "capture")
+        state.capture = stored_path(final, "capture")
         show_capture(scene, out)
         state.report = stored(out)
         return str(state.summary)
@@ -323,7 +317,7 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
         """Show the capture with its diagnosis; the comparison can be played from the panel."""
         state = scene.physgen_diagnose
         state.capture, state.report, state.video.comparison = (
-            _stored(final, name) for name in ("capture", "diagnosis", "video")
+            stored_path(final, name) for name in ("capture", "diagnosis", "video")
         )
         is_first = state.root is None
         show_capture(scene, Path(str(final["diagnosis"])))
@@ -331,118 +325,3 @@ class PHYSGEN_OT_explain_video(JobOperator, bpy.types.Operator):
             _show_first(scene)
         turn_to(bpy.context, *capture_view.capture_bounds(state.root, state.trial))
         return str(state.summary)
-
-
-class PHYSGEN_OT_add_effect(JobOperator, bpy.types.Operator):
-    """Add the found effect to the scene folder and bake it; without a reference bake, bake that first"""
-
-    bl_idname = "physgen.add_found_effect"
-    bl_label = "Add Effect and Bake"
-    bl_options = {"UNDO"}  # noqa: RUF012
-    job_title = "Bake"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Enabled if an effect was found that can be added."""
-        state = context.scene.physgen_diagnose
-        if not state.has_report or state.verdict in ("none", "unknown"):
-            cls.poll_message_set("The diagnosis names no effect that could be added")
-            return False
-        return super().poll(context)
-
-    def request(self, context: bpy.types.Context) -> Work:
-        """Add the effect to the scene; return one or two bakes as child processes."""
-        state = context.scene.physgen_diagnose
-        folder = load_scene(require_folder(state.scene_folder, "Scene"))
-        found = found_effects(read_json(report_folder(state) / REPORT_FILE))
-        with_effects(folder.model, found)
-        bake_before = not state.before.strip()
-        # A bake from an earlier run is reused while the scene is unchanged.
-        beside = folder_beside(folder.root, "bake_before")
-        request = AddRequest(
-            found=found,
-            before=beside if bake_before else require_folder(state.before, "Bake Before"),
-            after=bake_folder(folder_beside(folder.root, "bake_after")),
-            bake_before=bake_before,
-        )
-        settings = ("--frames", str(state.frames), "--fps", repr(state.fps), "--quality", state.quality)
-        preferred = python(context)
-
-        def run_bake(scene: Scene, out: Path, on_event: OnEvent, cancelled: IsCancelled) -> Event:
-            command = cli_command(find_python(preferred), "bake", str(scene.root), "--out", str(out), *settings)
-            return run_stage(command, on_event, cancelled)
-
-        return lambda on_event, cancelled: add_and_bake(
-            folder, request=request, run_bake=run_bake, on_event=on_event, cancelled=cancelled
-        )
-
-    def finished(self, scene: bpy.types.Scene, final: Event) -> str:
-        """Show both bakes."""
-        state = scene.physgen_diagnose
-        # Undo may have cleared the property.
-        state.scene_folder, state.before, state.after = (_stored(final, name) for name in ("scene", "before", "after"))
-        show_overlay(scene)
-        return "Effect added; the bakes before and after are overlaid"
-
-
-class PHYSGEN_OT_show_overlay(bpy.types.Operator):
-    """Show the bakes before and after in this scene"""
-
-    bl_idname = "physgen.show_overlay"
-    bl_label = "Show Before and After"
-    bl_options = {"UNDO"}  # noqa: RUF012
-
-    @report_errors
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Load both."""
-        show_overlay(context.scene)
-        return {"FINISHED"}
-
-
-def show_overlay(scene: bpy.types.Scene) -> None:
-    """Show both bakes of the scene folder in ``scene`` and hide the capture. Raises InputError."""
-    state = scene.physgen_diagnose
-    folder = load_scene(require_folder(state.scene_folder, "Scene"))
-    bakes = {
-        overlay.BEFORE: load_bake(require_folder(state.before, "Bake Before")),
-        overlay.AFTER: load_bake(require_folder(state.after, "Bake After")),
-    }
-    first, last, rate = overlay.overlay_frame_range(folder, bakes[overlay.AFTER])
-    built: list[bpy.types.Collection] = []
-    try:
-        for which, bake in bakes.items():
-            built.append(overlay.build_overlay(scene, folder, bake, which))
-    except PhysGenError:
-        for collection in built:
-            overlay.remove_overlay(collection)
-        raise
-    for old in (state.before_root, state.after_root):
-        if old is not None:
-            overlay.remove_overlay(old)
-    state.before_root, state.after_root = built
-    if state.root is not None:
-        state.root.hide_viewport = state.root.hide_render = True
-    overlay.show_overlay(*built, choice=state.overlay)
-    low, high = overlay.overlay_bounds(built[1])
-    turn_to(bpy.context, 2 * low - high, 2 * high - low)
-    scene.frame_start, scene.frame_end = first, last
-    capture_view.set_rate(scene, rate)
-
-
-class PHYSGEN_OT_clear_overlay(bpy.types.Operator):
-    """Remove both bakes from the scene and show the capture again; files are kept"""
-
-    bl_idname = "physgen.clear_overlay"
-    bl_label = "Clear Overlay"
-    bl_options = {"UNDO"}  # noqa: RUF012
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Remove the two collections."""
-        state = context.scene.physgen_diagnose
-        for collection in (state.before_root, state.after_root):
-            if collection is not None:
-                overlay.remove_overlay(collection)
-        if state.root is not None:
-            state.root.hide_viewport = state.root.hide_render = False
-            capture_view.play_range(context.scene, state.root, state.trial)
-        return {"FINISHED"}

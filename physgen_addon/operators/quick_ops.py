@@ -12,7 +12,8 @@ from ..props.body_props import bodies, is_body
 from ..props.preferences import PIE
 from ..text import count
 from .asset_ops import PHYSGEN_OT_open_sample
-from .bake_ops import PHYSGEN_OT_bake, PHYSGEN_OT_free_bake
+from .bake_cache_ops import PHYSGEN_OT_free_bake
+from .bake_ops import PHYSGEN_OT_bake
 from .body_ops import (
     OfSelected,
     PHYSGEN_OT_add_bodies,

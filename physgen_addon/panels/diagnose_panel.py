@@ -11,17 +11,15 @@ import bpy
 
 from .. import blend_trust, text
 from ..operators.diagnose_ops import (
-    PHYSGEN_OT_add_effect,
     PHYSGEN_OT_clear_capture,
-    PHYSGEN_OT_clear_overlay,
     PHYSGEN_OT_diagnose,
     PHYSGEN_OT_explain_video,
     PHYSGEN_OT_follow,
     PHYSGEN_OT_load_capture,
     PHYSGEN_OT_load_diagnosis,
     PHYSGEN_OT_open_report,
-    PHYSGEN_OT_show_overlay,
 )
+from ..operators.effect_ops import PHYSGEN_OT_add_effect, PHYSGEN_OT_clear_overlay, PHYSGEN_OT_show_overlay
 from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
 from .sidebar import DIAGNOSE, Sidebar, draw_job, optional
 

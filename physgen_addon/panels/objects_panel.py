@@ -3,22 +3,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import bpy
-from mathutils import Vector
 
 from ...sim.constitutive import COHERENT, SHAPED, cohesion_of
 from .. import bake_state, text
 from ..operators.body_ops import (
     PHYSGEN_OT_add_bodies,
-    PHYSGEN_OT_add_pin,
-    PHYSGEN_OT_clear_motion,
     PHYSGEN_OT_copy_material,
     PHYSGEN_OT_delete_preset,
     PHYSGEN_OT_remove_body,
-    PHYSGEN_OT_remove_pin,
     PHYSGEN_OT_reset_preset,
     PHYSGEN_OT_save_preset,
     PHYSGEN_OT_select_bodies,
@@ -30,14 +25,11 @@ from ..props.body_props import bodies, is_body
 from ..props.material_props import ADVANCED, LAW_FIELDS, WITH_UNITS, is_modified, shown_as
 from .sidebar import (
     COMPOSE,
-    MOTION,
     OBJECTS,
     Sidebar,
     active_body,
-    draw_arrows,
     draw_job,
     draw_static_friction_note,
-    is_in,
     optional,
     settings,
 )
@@ -142,7 +134,9 @@ class PHYSGEN_PT_objects(Sidebar, bpy.types.Panel):
             text.sentences(layout, context, "Other objects collide with it. It is static, or follows its keyframes.")
 
 
-class _Part(Sidebar):
+class DynamicPart(Sidebar):
+    """Below the panel of objects, for one that is dynamic."""
+
     bl_parent_id = "PHYSGEN_PT_objects"
 
     @classmethod
@@ -152,7 +146,7 @@ class _Part(Sidebar):
         return item is not None and item.physgen.role == "dynamic"
 
 
-class PHYSGEN_PT_material(_Part, bpy.types.Panel):
+class PHYSGEN_PT_material(DynamicPart, bpy.types.Panel):
     """Material of the object"""
 
     bl_label = "Material"
@@ -205,7 +199,7 @@ def _draw_number(layout: bpy.types.UILayout, material: Any, name: str) -> None:
     layout.prop(material, shown_as(name) if name in WITH_UNITS else name)
 
 
-class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
+class PHYSGEN_PT_advanced(DynamicPart, bpy.types.Panel):
     """Settings that few materials need: fibres, stiffness that gives way, and numbers to be animated"""
 
     bl_parent_id = "PHYSGEN_PT_material"
@@ -235,7 +229,7 @@ class PHYSGEN_PT_advanced(_Part, bpy.types.Panel):
                 numbers.prop(material, name)
 
 
-class PHYSGEN_PT_inside(_Part, bpy.types.Panel):
+class PHYSGEN_PT_inside(DynamicPart, bpy.types.Panel):
     """Solid or hollow; turning to sand"""
 
     bl_label = "Filling"
@@ -332,114 +326,3 @@ def _draw_result(layout: bpy.types.UILayout, state: bpy.types.PropertyGroup) -> 
         )
         deepest = f"{text.length(pair.deepest_before)} → {text.length(pair.deepest_after)}"
         column.label(text=f"deepest {deepest}", icon="BLANK1")
-
-
-class PHYSGEN_UL_pins(bpy.types.UIList):
-    """List of pins."""
-
-    def draw_item(
-        self,
-        context: bpy.types.Context,
-        layout: bpy.types.UILayout,
-        data: Any,
-        item: Any,
-        icon: int,
-        active_data: Any,
-        active_property: str,
-    ) -> None:
-        """Draw the box and its problem, if any."""
-        box = item.box
-        row = layout.row(align=True)
-        row.alert = box is None or not is_in(box, context.scene)
-        row.prop(item, "box", text="", icon="CUBE")
-        if row.alert:
-            row.label(text="", icon="ERROR")
-
-
-class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
-    """Initial motion of the active object"""
-
-    bl_idname = "PHYSGEN_PT_motion"
-    bl_label = "Motion"
-    bl_order = MOTION
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Shown if an object may be dynamic."""
-        return bool(bodies(context.scene))
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw velocity and spin."""
-        layout, item = self.layout, active_body(context)
-        if item is None:
-            text.sentences(layout, context, "Select an object of the simulation to set its initial motion.")
-            return
-        if item.physgen.role == "collider":
-            text.sentences(layout, context, "A collider follows its keyframes. Animate it as any object.")
-            return
-        body = item.physgen
-        column = settings(layout, context)
-        column.prop(body, "velocity")
-        column.prop(body, "speed")
-        column.prop(body, "spin")
-        turns = Vector(body.spin).length / (2 * math.pi)
-        if turns > 0:
-            split = column.split(factor=0.4)
-            split.label(text="")
-            split.active = False
-            split.label(text=f"{turns:.2g} turns/s")
-        row = layout.row(align=True)
-        draw_arrows(row, context)
-        cleared = row.row(align=True)
-        cleared.enabled = column.enabled
-        cleared.operator(PHYSGEN_OT_clear_motion.bl_idname, text="", icon="LOOP_BACK")
-
-
-class PHYSGEN_PT_start(_Part, bpy.types.Panel):
-    """When the active object begins to move"""
-
-    bl_parent_id = "PHYSGEN_PT_motion"
-    bl_label = "Start"
-    bl_order = 0
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the frame and sleep."""
-        body = active_body(context).physgen
-        column = settings(self.layout, context)
-        optional(column, body, "waits", "start_frame", "At Frame")
-        column.prop(body, "asleep")
-        if body.asleep:
-            column.prop(body, "held")
-
-
-class PHYSGEN_PT_pins(_Part, bpy.types.Panel):
-    """Pins of the active object"""
-
-    bl_parent_id = "PHYSGEN_PT_motion"
-    bl_label = "Hold"
-    bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw pins and shape stiffness."""
-        layout, body = self.layout, active_body(context).physgen
-        locked = settings(layout, context)
-        if body.pins:
-            row = locked.row()
-            row.template_list("PHYSGEN_UL_pins", "", body, "pins", body, "pin_index", rows=2)
-            side = row.column(align=True)
-            side.operator(PHYSGEN_OT_add_pin.bl_idname, text="", icon="ADD")
-            side.operator(PHYSGEN_OT_remove_pin.bl_idname, text="", icon="REMOVE")
-            if any(pin.box is None or not is_in(pin.box, context.scene) for pin in body.pins):
-                text.sentences(
-                    locked, context, "A pin has lost its box: choose another empty or remove it.", icon="ERROR"
-                )
-            text.sentences(locked, context, "Move, scale or animate the box in the viewport.")
-        else:
-            text.sentences(locked, context, "A pin is a box: the part of the object inside it is held.")
-            locked.operator(PHYSGEN_OT_add_pin.bl_idname, icon="PINNED")
-        column = locked.column()
-        optional(column, body, "holds_shape", "goal_stiffness", "Hold Shape")
-        if body.holds_shape:
-            column.prop(body, "goal_damping")

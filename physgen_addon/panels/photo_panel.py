@@ -24,11 +24,10 @@ from ..operators.photo_object_ops import (
 from ..operators.photo_ops import (
     PHYSGEN_OT_draw_box,
     PHYSGEN_OT_open_photo,
-    PHYSGEN_OT_open_photo_report,
-    PHYSGEN_OT_reconstruct,
     PHYSGEN_OT_remove_box,
     PHYSGEN_OT_use_image,
 )
+from ..operators.reconstruct_ops import PHYSGEN_OT_open_photo_report, PHYSGEN_OT_reconstruct
 from ..photo.photo_consent import OFFLINE, is_allowed
 from ..photo.photo_request import made_folder, scene_folder
 from ..props.preferences import python

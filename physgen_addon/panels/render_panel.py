@@ -9,15 +9,9 @@ import bpy
 
 from .. import blend_trust, text
 from ..background_jobs import running
+from ..operators.export_ops import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_usd, PHYSGEN_OT_make_independent
 from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command, written
-from ..operators.render_ops import (
-    PHYSGEN_OT_export_alembic,
-    PHYSGEN_OT_export_usd,
-    PHYSGEN_OT_look_nodes,
-    PHYSGEN_OT_make_independent,
-    PHYSGEN_OT_render_still,
-    PHYSGEN_OT_render_video,
-)
+from ..operators.render_ops import PHYSGEN_OT_look_nodes, PHYSGEN_OT_render_still, PHYSGEN_OT_render_video
 from ..render.render_options import VIDEO_CODECS
 from .sidebar import RENDER, Sidebar, draw_job, optional
 

@@ -11,15 +11,13 @@ import bpy
 from .. import text
 from ..background_jobs import running
 from ..bake_state import BakeState, shows, state
-from ..operators.bake_ops import (
-    PHYSGEN_OT_bake,
-    PHYSGEN_OT_estimate_bake,
+from ..operators.bake_cache_ops import (
     PHYSGEN_OT_free_bake,
     PHYSGEN_OT_free_old_bakes,
     PHYSGEN_OT_free_one_bake,
-    PHYSGEN_OT_pause_bake,
     PHYSGEN_OT_relink_caches,
 )
+from ..operators.bake_ops import PHYSGEN_OT_bake, PHYSGEN_OT_estimate_bake, PHYSGEN_OT_pause_bake
 from ..operators.world_ops import PHYSGEN_OT_frames_from_scene, PHYSGEN_OT_play_bake_only
 from ..props.body_props import bodies
 from .sidebar import (

@@ -20,7 +20,6 @@ from bpy.props import (
 from ...sim.app.bake_options import BakeOptions
 from ..paths import RELATIVE
 from ..playback import capture_view
-from ..playback import capture_view as overlay
 from ..playback.capture_scene import LAYERS
 from ..text import readable
 from .generated_properties import from_field, switch
@@ -49,7 +48,7 @@ def _on_view(self: Any, context: bpy.types.Context) -> None:
 
 
 def _on_overlay(self: "PHYSGEN_PG_diagnose", context: bpy.types.Context) -> None:
-    overlay.show_overlay(self.before_root, self.after_root, choice=self.overlay)
+    capture_view.show_overlay(self.before_root, self.after_root, choice=self.overlay)
 
 
 def apply_view(state: "PHYSGEN_PG_diagnose") -> None:

@@ -17,7 +17,7 @@ bpy = pytest.importorskip("bpy")
 from physgen.batch.cli import build_parser
 from physgen.batch.commands.flags import object_requests, reconstruct_options
 from physgen.batch.commands.photo_commands import add_reconstruct
-from physgen.physgen_addon.operators import photo_ops
+from physgen.physgen_addon.operators import reconstruct_ops
 from physgen.physgen_addon.operators.photo_ops import (
     add_box,
     set_photo,
@@ -247,7 +247,7 @@ def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, 
     photo.camera, photo.horizon, photo.roll, photo.report = "HORIZON", -0.1, math.radians(4), True
     photo.use_fov, photo.fov = True, math.radians(47)
     assert made_folder(photo) is None
-    monkeypatch.setattr(photo_ops, "run_stage", command_here)
+    monkeypatch.setattr(reconstruct_ops, "run_stage", command_here)
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
     folder = made_folder(photo)
     assert folder == scene_folder(photo)
@@ -265,7 +265,7 @@ def test_a_correction_repeats_only_what_depends_on_it(first_fill, photo, world, 
         photo.boxes[0].preset = "auto"
         return command_here(*given, **named)
 
-    monkeypatch.setattr(photo_ops, "run_stage", undone_meanwhile)
+    monkeypatch.setattr(reconstruct_ops, "run_stage", undone_meanwhile)
     assert bpy.ops.physgen.reconstruct() == {"FINISHED"}
     assert scene.physgen.photo_root.objects["ball"].physgen.material.preset == "jelly"
     second = stages(folder)

@@ -10,7 +10,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon import context, paths
-from physgen.physgen_addon.operators import asset_ops, photo_ops, quick_ops
+from physgen.physgen_addon.operators import asset_ops, photo_ops, quick_ops, reconstruct_ops
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.body_props import bodies
 from physgen.physgen_addon.scene_io.export_scene import export_scene
@@ -147,7 +147,7 @@ def test_a_material_chosen_for_a_box_is_that_of_its_object():
     for name in ("cup", "spoon"):
         a_cube().physgen.enabled = True
         bpy.context.object.physgen.source = name
-    photo_ops.set_materials(bpy.context.scene, photo_ops.chosen_materials(bpy.context.scene))
+    reconstruct_ops.set_materials(bpy.context.scene, reconstruct_ops.chosen_materials(bpy.context.scene))
     found = {item.physgen.source: item.physgen.material.preset for item in bodies(bpy.context.scene)}
     assert found == {"cup": "jelly", "spoon": "medium"}, "a box of its own choice, and one that is left to what it is"
 

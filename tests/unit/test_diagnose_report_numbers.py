@@ -201,5 +201,5 @@ def test_the_page_names_its_capture_and_the_button_as_blender_does(tmp_path):
     assert "bounces · Where simulation and recording diverge" in said(page)
     assert '<span class="flag">--out</span>' in page
     (label,) = re.findall("<kbd>(.*?)</kbd>", page)
-    operators = (Path(physgen.__file__).parent / "physgen_addon" / "operators" / "diagnose_ops.py").read_text()
+    operators = (Path(physgen.__file__).parent / "physgen_addon" / "operators" / "effect_ops.py").read_text()
     assert f'bl_label = "{label}"' in operators
