@@ -16,7 +16,8 @@ from ..context import redraw
 from ..interpreter import cli_command, find_python
 from ..props import preferences
 from ..props.body_props import bodies
-from .preview_session import Clip, Session, shade_vertices
+from .preview_session import Session
+from .preview_worker import Clip, shade_vertices
 
 STEP_S = 0.04
 JOIN_S = 0.5

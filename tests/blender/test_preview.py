@@ -14,11 +14,8 @@ from physgen.physgen_addon import gizmos as maths
 from physgen.physgen_addon.gizmos import SHOW_ARROWS
 from physgen.physgen_addon.interpreter import cli_command
 from physgen.physgen_addon.preview import live_preview, preview_session
-from physgen.physgen_addon.preview.preview_session import (
-    Clip,
-    Session,
-    shade_vertices,
-)
+from physgen.physgen_addon.preview.preview_session import Session
+from physgen.physgen_addon.preview.preview_worker import Clip, shade_vertices
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.errors import InputError
 
