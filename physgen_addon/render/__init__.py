@@ -6,7 +6,8 @@ render_options.py      options, file formats, flags
 renderer.py            one frame: small renders over the photo
 render_scene.py        the scene as three Blender scenes; render_regions.py what has to be rendered
 object_material.py     objects' materials and their highlights
-render_engines.py      Cycles and EEVEE; sky_lamps.py the sky as lamps, for EEVEE
+render_engines.py      Cycles and EEVEE
+scene_light.py         environment and sun as Blender has them; sky_lamps.py the sky as lamps, for EEVEE
 lighting.py            reference lighting, shadows, reflections
 motion_blur.py         motion while the shutter is open
 clean_plate.py         the photo without its objects

@@ -28,7 +28,8 @@ from . import render_engines
 from .motion_blur import Moment
 from .render_options import RenderOptions
 from .render_regions import NEAR_REACH, Box, feather, ground_depth, object_box, shadow_region
-from .render_scene import BlenderScene, RenderObject, environment_lamps, get_rest_light, set_rest_light
+from .render_scene import BlenderScene, RenderObject, get_rest_light, set_rest_light
+from .scene_light import environment_lamps
 
 RAY_BUDGET = 400_000
 """Rays of one object, divided among its vertices and the lamps."""
