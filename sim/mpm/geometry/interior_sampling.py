@@ -78,6 +78,67 @@ def sample_interior(
         raise InputError(f"jitter is {jitter!r}: give a share of the spacing from 0 to 0.45")
     points, triangles = validated(vertices, faces)
     oriented = check_closed(triangles)
+    lattice = _lattice_in(points, triangles, spacing, oriented)
+    step, fine = lattice.step, lattice.test_points()
+    centres = lattice.inside[FINE // 2 :: FINE, FINE // 2 :: FINE, FINE // 2 :: FINE]
+    positions = lattice.low + (np.argwhere(centres) + 0.5) * step
+    # Number of the particle in each test point's own cell, -1 without one: most points need no search for the nearest.
+    own = np.where(centres, np.cumsum(centres).reshape(centres.shape) - 1, -1)
+    own = own.repeat(FINE, axis=0).repeat(FINE, axis=1).repeat(FINE, axis=2)[lattice.inside]
+    on_lattice = len(positions)
+    positions = _cover_thin_parts(positions, fine[own < 0], lattice)
+    if len(positions) < MIN_PARTICLES:
+        raise _too_few(len(positions), spacing, lattice.extent)
+    rng = np.random.default_rng(seed)
+    if scattered:
+        positions = _scattered(positions, fine, lattice, rng)
+    owners, unknown = own.copy(), own < 0
+    if scattered or len(positions) > on_lattice:
+        unknown[:] = True
+    owners[unknown] = cKDTree(positions / step).query(fine[unknown] / step)[1]
+    shares = np.maximum(np.bincount(owners, minlength=len(positions)), 1).astype(np.float64)
+    volume = abs(signed_volume(points, triangles)) if oriented else float(step.prod()) * len(fine) / FINE**3
+    if jitter and not scattered:
+        # After the volumes, so that all worlds of other seeds weigh the same.
+        positions = lattice.kept_inside(positions + rng.uniform(-jitter, jitter, positions.shape) * step, positions)
+    return InteriorSample(
+        positions=positions,
+        volumes=shares * (volume / shares.sum()),
+        contact_radii=np.minimum(0.5 * spacing, _surface_distance(points, triangles, positions, spacing)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Lattice:
+    """Cells of about the particle spacing in a mesh's bounding box, each with ``FINE``³ test points.
+
+    low: (3,) the box's corner. step: (3,) edges of a cell. counts: (3,) of cells. inside: (3 counts) which test points
+    the mesh holds.
+    """
+
+    low: Array
+    step: Array
+    counts: NDArray[np.int64]
+    inside: NDArray[np.bool_]
+
+    @property
+    def extent(self) -> Array:
+        return self.step * self.counts
+
+    def test_points(self) -> Array:
+        """Return the places (N, 3) of those inside."""
+        return np.asarray(self.low + (np.argwhere(self.inside) + 0.5) * (self.step / FINE))
+
+    def kept_inside(self, moved: Array, before: Array) -> Array:
+        """Return ``moved`` particles (N, 3) where their test points are inside, else where they were ``before``."""
+        index = np.floor((moved - self.low) / (self.step / FINE)).astype(np.int64)
+        boxed = ((index >= 0) & (index < self.counts * FINE)).all(axis=1)
+        index = np.clip(index, 0, self.counts * FINE - 1)
+        return np.where((boxed & self.inside[index[:, 0], index[:, 1], index[:, 2]])[:, None], moved, before)
+
+
+def _lattice_in(points: Array, triangles: Faces, spacing: float, oriented: bool) -> _Lattice:
+    """Return the lattice of a mesh. Raises InputError where that has no volume, or too much or too little for it."""
     low, high = points[triangles].min(axis=(0, 1)), points[triangles].max(axis=(0, 1))
     extent = high - low
     signed = signed_volume(points, triangles)
@@ -92,52 +153,25 @@ def sample_interior(
             f"spacing is {spacing:g} for a mesh of {extent[0]:g} x {extent[1]:g} x {extent[2]:g}: give a larger spacing"
         )
     step = extent / counts
-    fine_inside = inside_lattice(points, triangles, low, step / FINE, counts * FINE, oriented)
-    if not fine_inside.any():
+    inside = inside_lattice(points, triangles, low, step / FINE, counts * FINE, oriented)
+    if not inside.any():
         raise _too_few(0, spacing, extent)
-    centres = fine_inside[FINE // 2 :: FINE, FINE // 2 :: FINE, FINE // 2 :: FINE]
-    positions = low + (np.argwhere(centres) + 0.5) * step
-    fine = low + (np.argwhere(fine_inside) + 0.5) * (step / FINE)
-    # Number of the particle in each test point's own cell, -1 without one: most points need no search for the nearest.
-    own = np.where(centres, np.cumsum(centres).reshape(centres.shape) - 1, -1)
-    own = own.repeat(FINE, axis=0).repeat(FINE, axis=1).repeat(FINE, axis=2)[fine_inside]
-    on_lattice = len(positions)
-    positions = _cover_thin_parts(positions, fine[own < 0], low, step, counts)
-    if len(positions) < MIN_PARTICLES:
-        raise _too_few(len(positions), spacing, extent)
+    return _Lattice(low, step, counts, inside)
 
-    def kept_inside(moved: Array) -> Array:
-        """``moved`` particles where their test points are inside, too, else where they were."""
-        index = np.floor((moved - low) / (step / FINE)).astype(np.int64)
-        boxed = ((index >= 0) & (index < counts * FINE)).all(axis=1)
-        index = np.clip(index, 0, counts * FINE - 1)
-        return np.where((boxed & fine_inside[index[:, 0], index[:, 1], index[:, 2]])[:, None], moved, positions)
 
-    rng = np.random.default_rng(seed)
-    if scattered:
-        positions = kept_inside(positions + rng.uniform(-1.0, 1.0, positions.shape) * step)
-        # Means of a lattice's points would be drawn to its planes.
-        strewn = fine + rng.uniform(-0.5, 0.5, fine.shape) * (step / FINE)
-        for _ in range(EVENING):
-            owners = cKDTree(positions / step).query(strewn / step)[1]
-            size = np.bincount(owners, minlength=len(positions))
-            sums = np.stack([np.bincount(owners, strewn[:, c], minlength=len(positions)) for c in range(3)], axis=1)
-            middle = np.where(size[:, None] > 0, sums / np.maximum(size, 1)[:, None], positions)
-            positions = kept_inside(middle)
-    owners, unknown = own.copy(), own < 0
-    if scattered or len(positions) > on_lattice:
-        unknown[:] = True
-    owners[unknown] = cKDTree(positions / step).query(fine[unknown] / step)[1]
-    shares = np.maximum(np.bincount(owners, minlength=len(positions)), 1).astype(np.float64)
-    volume = abs(signed) if oriented else float(step.prod()) * len(fine) / FINE**3
-    if jitter and not scattered:
-        # After the volumes, so that all worlds of other seeds weigh the same.
-        positions = kept_inside(positions + rng.uniform(-jitter, jitter, positions.shape) * step)
-    return InteriorSample(
-        positions=positions,
-        volumes=shares * (volume / shares.sum()),
-        contact_radii=np.minimum(0.5 * spacing, _surface_distance(points, triangles, positions, spacing)),
-    )
+def _scattered(positions: Array, fine: Array, lattice: _Lattice, rng: np.random.Generator) -> Array:
+    """Return particles at ``positions`` (N, 3) moved off the lattice, then evened out over test points ``fine``."""
+    step = lattice.step
+    positions = lattice.kept_inside(positions + rng.uniform(-1.0, 1.0, positions.shape) * step, positions)
+    # Means of a lattice's points would be drawn to its planes.
+    strewn = fine + rng.uniform(-0.5, 0.5, fine.shape) * (step / FINE)
+    for _ in range(EVENING):
+        owners = cKDTree(positions / step).query(strewn / step)[1]
+        size = np.bincount(owners, minlength=len(positions))
+        sums = np.stack([np.bincount(owners, strewn[:, c], minlength=len(positions)) for c in range(3)], axis=1)
+        middle = np.where(size[:, None] > 0, sums / np.maximum(size, 1)[:, None], positions)
+        positions = lattice.kept_inside(middle, positions)
+    return positions
 
 
 def _too_few(count: int, spacing: float, extent: Array) -> InputError:
@@ -148,8 +182,9 @@ def _too_few(count: int, spacing: float, extent: Array) -> InputError:
     )
 
 
-def _cover_thin_parts(positions: Array, fine: Array, low: Array, step: Array, counts: NDArray[np.int64]) -> Array:
+def _cover_thin_parts(positions: Array, fine: Array, lattice: _Lattice) -> Array:
     """Return the particles with one more in each lattice cell whose inside test points ``fine`` have none nearby."""
+    low, step, counts = lattice.low, lattice.step, lattice.counts
     if len(positions):
         distance = cKDTree(positions / step).query(fine / step, distance_upper_bound=COVERED)[0]
         fine = fine[~np.isfinite(distance)]

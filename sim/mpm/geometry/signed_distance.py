@@ -227,6 +227,26 @@ def _buried(pieces: Array, mesh: Array) -> Array:
 
 def _distances(pieces: Array, whole: Array, shape: NDArray[np.int64]) -> NDArray[np.float32]:
     """Return distances (nx, ny, nz) to pieces (P, 3, 3), each part of a whole triangle (P, 3, 3), in lattice units."""
+    band = _near_surface(pieces, shape)
+    result = np.full(tuple(shape), np.inf, dtype=np.float32)
+    exact = band.distances <= BAND
+    result[tuple(band.points[exact].T)] = band.distances[exact]
+    _fill_beyond(result, band, whole)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Band:
+    """Lattice points near a surface. points: (n, 3) their indices. distances: (n,) to the surface, in lattice units,
+    exact up to ``BAND``. nearest: (n,) the piece that is there."""
+
+    points: NDArray[np.int64]
+    distances: Array
+    nearest: NDArray[np.int32]
+
+
+def _near_surface(pieces: Array, shape: NDArray[np.int64]) -> _Band:
+    """Return the points of the lattice of ``shape`` that may lie within ``BAND`` of ``pieces`` (P, 3, 3)."""
     centre = pieces.mean(axis=1)
     radius = np.linalg.norm(pieces - centre[:, None], axis=2).max(axis=1)
     reach = BAND + float(radius.max()) + HALF_DIAGONAL
@@ -272,42 +292,45 @@ def _distances(pieces: Array, whole: Array, shape: NDArray[np.int64]) -> NDArray
         np.minimum.at(best2, spot, distance2)
         first = distance2 == best2[spot]
         nearest[spot[first]] = piece[first]
-    del bound
-    best = np.sqrt(best2)
-    result = np.full(tuple(shape), np.inf, dtype=np.float32)
-    inner_band = np.stack(np.unravel_index(band, tuple(wide)), axis=1) - pad
-    exact = best <= BAND
-    result[tuple(inner_band[exact].T)] = best[exact]
+    points = np.stack(np.unravel_index(band, tuple(wide)), axis=1) - pad
+    return _Band(points, np.sqrt(best2), nearest)
+
+
+def _fill_beyond(result: NDArray[np.float32], band: _Band, whole: Array) -> None:
+    """Put distances where ``result`` (nx, ny, nz) is inf: to a triangle of ``whole`` (P, 3, 3) that is nearest to some
+    point of the band on the way, less than one spacing too far."""
+    shape = result.shape
     far = np.flatnonzero(np.isinf(result.reshape(-1)))
     if len(far) == 0:
-        return result
+        return
+    index = np.zeros(shape, dtype=np.int32)
+    index[tuple(band.points.T)] = np.arange(len(band.points))
     # On the way from a far point to the nearest place of the surface, at 3 less half a cell's diagonal from it, some
     # lattice point of the band is within half a diagonal. The way through it is at most 0.53 longer; the way through
     # the nearest of its shell (which are 0.43 thick) at most 0.43 more. So what is found is at most 0.97 too far.
     shells = np.linspace(BAND - 2 * HALF_DIAGONAL - 1e-6, BAND, SHELLS + 1)
     flat_result, via = result.reshape(-1), np.zeros(len(far), dtype=np.int32)
     for least, most in pairwise(shells):
-        apart = np.ones(tuple(shape), dtype=np.bool_)
-        apart[tuple(inner_band[(best >= least) & (best <= most)].T)] = False
+        apart = np.ones(shape, dtype=np.bool_)
+        apart[tuple(band.points[(band.distances >= least) & (band.distances <= most)].T)] = False
         if apart.all():
             continue
         beside = distance_transform_edt(apart, return_distances=False, return_indices=True).reshape(3, -1)
         for start in range(0, len(far), CHUNK):
             some = far[start : start + CHUNK]
             other = beside[:, some]
-            place = np.unravel_index(some, tuple(shape))
-            spot = index[np.ravel_multi_index(tuple(other + pad), tuple(wide))]
+            place = np.unravel_index(some, shape)
+            spot = index[tuple(other)]
             gap2 = sum((place[axis] - other[axis]) ** 2 for axis in range(3))
-            way = (np.sqrt(gap2) + best[spot]).astype(np.float32)
+            way = (np.sqrt(gap2) + band.distances[spot]).astype(np.float32)
             shorter = way < flat_result[some]
             flat_result[some[shorter]] = way[shorter]
             via[start : start + CHUNK][shorter] = spot[shorter]
     for start in range(0, len(far), CHUNK):
         some = far[start : start + CHUNK]
-        places = np.stack(np.unravel_index(some, tuple(shape)), axis=1).astype(np.float64)
-        straight = np.sqrt(squared_distances(places, whole[nearest[via[start : start + CHUNK]]]))
+        places = np.stack(np.unravel_index(some, shape), axis=1).astype(np.float64)
+        straight = np.sqrt(squared_distances(places, whole[band.nearest[via[start : start + CHUNK]]]))
         flat_result[some] = np.maximum(straight, BAND)
-    return result
 
 
 def overlap(a: Surface | NDArray[np.floating], b: DistanceLattice) -> float:
