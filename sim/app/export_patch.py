@@ -112,6 +112,25 @@ def _numbers(values: Array | tuple[float, ...] | list[float]) -> str:
     return " ".join(f"{float(v):.9g}" for v in np.ravel(values))
 
 
+def _add_tether(
+    root: ElementTree.Element,
+    world: ElementTree.Element,
+    body: ElementTree.Element,
+    tether: Mapping[str, float],
+    mass: float,
+) -> None:
+    """Tie ``body`` of ``mass`` in kg to a place of ``world``, by a string or a spring."""
+    anchor = _numbers([tether[f"anchor_{axis}"] for axis in "xyz"])
+    ElementTree.SubElement(world, "site", name="anchor", pos=anchor)
+    ElementTree.SubElement(body, "site", name="held", pos="0 0 0")
+    tendon = ElementTree.SubElement(root, "tendon")
+    length, stiffness = tether["rest_length"], tether["stiffness_per_mass"] * mass
+    spring = [0.0 if tether.get("string", 1.0) else length, length]
+    line = ElementTree.SubElement(tendon, "spatial", stiffness=f"{stiffness:.9g}", springlength=_numbers(spring))
+    for site in ("anchor", "held"):
+        ElementTree.SubElement(line, "site", site=site)
+
+
 def _mjcf(capture: Capture, item: CaptureObject, settings: _Settings) -> str:
     from ..diagnose.rigid.rigid_simulator import CONTACT_TIME, STEPS, damping_ratio, rigid_body
 
@@ -163,15 +182,7 @@ def _mjcf(capture: Capture, item: CaptureObject, settings: _Settings) -> str:
         hidden |= {"mass": f"{share * mass:.9g}", "contype": "0", "conaffinity": "0"}
         ElementTree.SubElement(placed, "geom", {"name": "hidden_mass", **hidden})
     if settings.tether:
-        anchor = _numbers([settings.tether[f"anchor_{axis}"] for axis in "xyz"])
-        ElementTree.SubElement(world, "site", name="anchor", pos=anchor)
-        ElementTree.SubElement(placed, "site", name="held", pos="0 0 0")
-        tendon = ElementTree.SubElement(root, "tendon")
-        length, stiffness = settings.tether["rest_length"], settings.tether["stiffness_per_mass"] * mass
-        spring = [0.0 if settings.tether.get("string", 1.0) else length, length]
-        line = ElementTree.SubElement(tendon, "spatial", stiffness=f"{stiffness:.9g}", springlength=_numbers(spring))
-        for site in ("anchor", "held"):
-            ElementTree.SubElement(line, "site", site=site)
+        _add_tether(root, world, placed, settings.tether, mass)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 

@@ -99,6 +99,18 @@ def reconstruct(
         )
 
 
+def _up_to_date(out: Path, inputs_hash: str, objects: Sequence[ObjectRequest]) -> Scene | None:
+    """Return the scene in ``out`` if it is of these inputs and its ``objects`` of the same materials; else None."""
+    stamp = read_stamp(out)
+    # What an object is made of is decided with its shape; motion is not, and is set afterwards.
+    if stamp is None or stamp.inputs_hash != inputs_hash or stamp.presets != tuple(item.preset for item in objects):
+        return None
+    try:
+        return load_scene(out)
+    except InputError:
+        return None
+
+
 def _reconstruct_cached(
     request: Request,
     out: Path,
@@ -123,21 +135,11 @@ def _reconstruct_cached(
     for sentence in recover(out):
         on_event({"event": "notice", "stage": "reconstruct", "message": sentence})
     inputs_hash = _inputs_hash(photo, objects, options, ask, answered)
-    stamp = read_stamp(out)
-    if (
-        stamp is not None
-        and stamp.inputs_hash == inputs_hash
-        # What an object is made of is decided with its shape; motion is not, and is set afterwards.
-        and stamp.presets == tuple(item.preset for item in objects)
-    ):
-        try:
-            folder = load_scene(out)
-        except InputError:
-            pass
-        else:
-            on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
-            model = settle(folder)
-            return folder if model == folder.model else save_scene(out, model)
+    folder = _up_to_date(out, inputs_hash, objects)
+    if folder is not None:
+        on_event({"event": "notice", "stage": "reconstruct", "message": f"up to date: {out}"})
+        model = settle(folder)
+        return folder if model == folder.model else save_scene(out, model)
     from ..reconstruct import reconstruct_photo
 
     # Imported here, because planning a farm's jobs must not pay for the engine's geometry.

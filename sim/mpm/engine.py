@@ -96,17 +96,7 @@ class Engine:
         self._touches = upload_new(numbers.touches)
         self._pairs = upload_new(numbers.pairs)
         self._adheres = numbers.adheres
-        touches, pairs = numbers.touch_adhesion, numbers.pair_adhesion
-        if not self._adheres:
-            touches, pairs = touches[:0], pairs[:0]
-        self._adhesion = AdhesionArrays(
-            touch_count=len(touches),
-            pair_count=len(pairs),
-            touches=upload_new(touches),
-            pairs=upload_new(pairs),
-            touch_sums=new_array(ti.i64, max(1, len(touches))),
-            pair_sums=new_array(ti.i64, max(1, len(pairs))),
-        )
+        self._adhesion = _new_adhesion(numbers)
         self._means = new_array(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
         self._control = new_array(ti.f64, self.world_count * layout.CONTROL_ROW)
         control = np.zeros((self.world_count, layout.CONTROL_ROW))
@@ -445,6 +435,21 @@ class Engine:
             control=self._control,
             means=self._means,
         )
+
+
+def _new_adhesion(numbers: PackedWorlds) -> AdhesionArrays:
+    """The arrays of bonds; empty where nothing adheres."""
+    touches, pairs = numbers.touch_adhesion, numbers.pair_adhesion
+    if not numbers.adheres:
+        touches, pairs = touches[:0], pairs[:0]
+    return AdhesionArrays(
+        touch_count=len(touches),
+        pair_count=len(pairs),
+        touches=upload_new(touches),
+        pairs=upload_new(pairs),
+        touch_sums=new_array(ti.i64, max(1, len(touches))),
+        pair_sums=new_array(ti.i64, max(1, len(pairs))),
+    )
 
 
 def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:

@@ -106,29 +106,7 @@ def reconstruct_photo(
         # The kind of an object determines its shape as well.
         objects = [replace(item, kind=item.kind or known.name) for item, known in zip(objects, physics, strict=True)]
         run = replace(run, objects=objects)
-        steps.begin("camera")
-        depth = run.depth()
-        estimate = estimate_camera(
-            picture, seen, options, depth, steps.notice, lambda: _boxes_of_things(picture.pixels)
-        )
-        layers, bodies, gloss = run.layers_and_bodies(seen, boxes, estimate.camera, depth)
-        physics = run.decided_by_bodies(physics, bodies, seen)
-        (folder / "light").mkdir()
-        steps.begin("light")
-        radiance, light = run.light(layers, estimate.camera, bodies)
-        write_environment(folder / ENVIRONMENT_FILE, radiance)
-        looks = estimate_appearances(layers, estimate.camera, bodies, objects, physics, radiance, light, store, steps)
-        steps.begin("write")
-        found = SceneEstimate(
-            pixels=picture.pixels,
-            layers=layers,
-            view=estimate.camera,
-            bodies=bodies,
-            metres=run.metres_per_unit(bodies, physics, estimate),
-            light=light,
-            looks=looks,
-            gloss=gloss,
-        )
+        found, estimate, physics = run.estimated(seen, boxes, physics, folder)
         scene = write_scene(folder, found, objects, physics, _friction(answers, options))
         if at_rest is not None:
             scene = at_rest(Scene(folder, scene), steps.notice)
@@ -179,6 +157,41 @@ class _Run:
             steps.notice(f"{error}; the objects are judged by their names")
             return None
         return read_answer(str(made["raw"]), len(names))
+
+    def estimated(
+        self, seen: Sequence[Mask], boxes: Sequence[Box], physics: Sequence[ObjectPhysics], folder: Path
+    ) -> tuple[SceneEstimate, CameraEstimate, tuple[ObjectPhysics, ...]]:
+        """Return what the photo shows, its camera, and each object's ``physics``, completed from its shape.
+
+        seen: (H, W) visible pixels of each object, which lies in its box of ``boxes``. Writes the environment map into
+        the scene folder ``folder``.
+        """
+        steps, objects, pixels = self.steps, self.objects, self.picture.pixels
+        steps.begin("camera")
+        depth = self.depth()
+        estimate = estimate_camera(
+            self.picture, seen, self.options, depth, steps.notice, lambda: _boxes_of_things(pixels)
+        )
+        view = estimate.camera
+        layers, bodies, gloss = self.layers_and_bodies(seen, boxes, view, depth)
+        decided = self.decided_by_bodies(physics, bodies, seen)
+        (folder / "light").mkdir()
+        steps.begin("light")
+        radiance, light = self.light(layers, view, bodies)
+        write_environment(folder / ENVIRONMENT_FILE, radiance)
+        looks = estimate_appearances(layers, view, bodies, objects, decided, radiance, light, self.store, steps)
+        steps.begin("write")
+        found = SceneEstimate(
+            pixels=pixels,
+            layers=layers,
+            view=view,
+            bodies=bodies,
+            metres=self.metres_per_unit(bodies, decided, estimate),
+            light=light,
+            looks=looks,
+            gloss=gloss,
+        )
+        return found, estimate, decided
 
     def depth(self) -> DepthMap | None:
         """Return the user's or the depth estimator's depth map (H, W); None where neither is given."""

@@ -81,7 +81,6 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     """
     shown, cosine = _shown(camera, body, mask)
     photo = shown & (cosine > SQUARE)
-    colours = body.pixels if body.colours is None else body.colours
     if photo.all():
         return TexturedSurface(body.vertices, body.faces, texture.uv(body.pixels), texture.pixels, texture.alpha)
     rest = body.faces[~photo]
@@ -103,27 +102,10 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     corner = (texture.left + 0.5, texture.top + 0.5)
     inside = _cropped(mask, texture)
     matter = plain_matter(texture.pixels, inside)
-    size_px = float(np.sqrt(inside.sum()))
-    seen = seen_vertices(camera, body)
-    behind = smoothed(body, distance_behind(body, seen, size_px))
-    flatness = flat_sides(body, normals)
-    # Beyond an edge, light is another one at once.
-    unlit = np.maximum(1.0 - np.exp(-behind / (EVEN * size_px)), flatness)[:, None]
     light = light_on(camera, body, texture, inside)
     falling = np.zeros((*inside.shape, 3), dtype=np.float32) if light is None else light.picture
-    blend, seam = _without_seams(body, seen, colours, unlit, texture, matter, falling, size_px)
     hidden = vertex_share(body, (cosine > 0) & ~shown)
-    of_vertices = SurfaceValues(
-        place=body.vertices,
-        normal=vertex_normals(body),
-        counterpart=colours,
-        pixel=body.pixels,
-        hidden=hidden[:, None],
-        flatness=flatness[:, None],
-        unlit=unlit,
-        blended=blend,
-        seam=seam[:, None],
-    )
+    of_vertices = _values_at_vertices(camera, body, texture, inside, matter, falling, hidden)
     of_charts = SurfaceValues(*(np.array(value[charts.source], dtype=np.float64) for value in of_vertices))
     if body.corner_colours is not None:
         of_charts.counterpart[charts.faces] = body.corner_colours[~photo]
@@ -152,6 +134,41 @@ def textured_body(camera: Camera, body: BodyMesh, texture: CropTexture, mask: Ma
     above = shading_values(shading_of_photo(light, place, faces[photo], lit[photo]))
     shading = shading_values(shading_of_charts(light, texels, own.share, of_normal, corner))
     return replace(surface, shading=_joined(above, found.spread(shading, (size[0], charts.size[1]))))
+
+
+def _values_at_vertices(
+    camera: Camera,
+    body: BodyMesh,
+    texture: CropTexture,
+    mask: Mask,
+    matter: PlainMatter,
+    light: NDArray[np.float32],
+    hidden: NDArray[np.float64],
+) -> SurfaceValues:
+    """What the colours at the vertices (V) of ``body`` depend on.
+
+    mask: (h, w) the object in ``texture``. light: (h, w, 3) its logarithm. hidden: (V,) by others of its faces.
+    """
+    size = float(np.sqrt(mask.sum()))
+    colours = body.pixels if body.colours is None else body.colours
+    normals, _ = face_normals(body.vertices[body.faces])
+    seen = seen_vertices(camera, body)
+    behind = smoothed(body, distance_behind(body, seen, size))
+    flatness = flat_sides(body, normals)
+    # Beyond an edge, light is another one at once.
+    unlit = np.maximum(1.0 - np.exp(-behind / (EVEN * size)), flatness)[:, None]
+    blend, seam = _without_seams(body, seen, colours, unlit, texture, matter, light, size)
+    return SurfaceValues(
+        place=body.vertices,
+        normal=vertex_normals(body),
+        counterpart=colours,
+        pixel=body.pixels,
+        hidden=hidden[:, None],
+        flatness=flatness[:, None],
+        unlit=unlit,
+        blended=blend,
+        seam=seam[:, None],
+    )
 
 
 def _joined(photo: NDArray[Number], charts: NDArray[Number]) -> NDArray[Number]:
