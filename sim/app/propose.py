@@ -19,7 +19,7 @@ from ..validation import parse, read_json, to_json
 
 FORMAT = "physgen-proposals/1"
 LIST_FILE, PICTURE_FILE = "proposals.json", "proposals.jpg"
-REVISION = 17
+REVISION = 18
 """Raised with every change that changes which objects are proposed."""
 SEARCHED = 1024
 """Longest side in pixels of the photo as it is read; the search itself needs less."""

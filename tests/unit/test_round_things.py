@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 from physgen.sim.app.propose import best_proposals
-from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.object_proposals import propose_boxes
 from physgen.sim.reconstruct.segmentation.round_things import CUT_SCORE, circles_of_a_kind, round_things
 from scipy import ndimage
@@ -59,11 +58,19 @@ def test_a_photo_of_one_thing_with_round_parts_is_not_of_these():
     # Six discs of 18 pixels cover 3.5 % of it.
     assert circles_of_a_kind(pixels) == []
     pixels = coins(ROWS)
-    coat = Proposal((0.0, 0.0, 480.0, 360.0), 0.97)
-    group = Proposal((20.0, 30.0, 460.0, 235.0), 0.97)
-    few = coins(ROWS[:5])
-    assert round_things(few, [coat], 0.8) == [] and len(round_things(few, [Proposal(coat.box, 0.7)], 0.8)) == 5
-    assert len(round_things(pixels, [group], 0.8)) == len(ROWS)
+    coat, group = np.zeros((2, HEIGHT, WIDTH), dtype=bool)
+    coat[10:350, 10:470] = group[30:235, 20:460] = True
+    pixels[coat & (pixels.min(axis=2) > 220)] = (90, 60, 120)
+    assert round_things(pixels, [(coat, 0.97)], 0.8) == []
+    assert len(round_things(pixels, [(coat, 0.7)], 0.8)) == len(ROWS)
+    assert len(round_things(coins(ROWS), [(group, 0.97)], 0.8)) == len(ROWS)
+
+
+def test_what_is_between_those_of_a_group_may_be_their_ground():
+    spread = [(60 + 120 * i, 60 + 110 * j, 22) for i in range(4) for j in range(3)]
+    group = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    group[30:310, 30:450] = True
+    assert len(round_things(coins(spread), [(group, 0.97)], 0.8)) == len(spread)
 
 
 def test_four_circles_are_not_many():

@@ -21,6 +21,7 @@ from skimage.segmentation import felzenszwalb, slic
 from ...composite.srgb import cielab
 from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
+from .alike_blocks import alike_blocks
 from .border_ownership import lines_go_on, sides_go_on
 from .box_crop import crop_around_box, edge_strength
 from .colour_models import ground_likelihood
@@ -41,7 +42,7 @@ from .proposal_features import (
     score_of,
     share_on_edges,
 )
-from .round_things import round_things
+from .round_things import circles_of_a_kind, round_things
 from .whole_objects import CUT, Candidate, stacked_parts, whole_objects
 
 Pixels = NDArray[np.uint8]
@@ -115,8 +116,11 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
         x0, y0, x1, y1 = _loose(extent_of(mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
         result.append(Proposal((float(box[0]), float(box[1]), float(box[2]), float(box[3])), round(value, 3)))
-    alike = round_things(pixels, result, LEFT_ASIDE + 0.01)
-    return with_model(alike or things_before_backdrop(pixels, result), result, LEFT_ASIDE + 0.01)[:most]
+    seen, least = list(zip(masks, listed, strict=True)), LEFT_ASIDE + 0.01
+    alike = round_things(pixels, seen, least)
+    if not alike and not circles_of_a_kind(pixels):
+        alike = alike_blocks(pixels, seen, least)
+    return with_model(alike or things_before_backdrop(pixels, result), result, least)[:most]
 
 
 def _owning(found: list[tuple[Examined, float]], pixels: Pixels) -> list[tuple[Examined, float]]:

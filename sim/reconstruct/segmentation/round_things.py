@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..reconstruct_options import Proposal
+from .mask_geometry import Mask, grown, ring_around
+from .proposal_features import copy_of, lab_of
 
 Pixels = NDArray[np.uint8]
 
@@ -32,6 +34,9 @@ INSIDE = 0.8
 """Distance of two centres over the larger radius, below which the smaller circle is a ring on the larger thing."""
 LAPPED = 0.1
 """Share of the smaller radius by which two circles may overlap before one thing lies on the other."""
+LARGER, HELD, STEP = 4.0, 0.4, 8.0
+"""Area of something over that of one of the things from which it is much larger; share of it that they fill in a group;
+colour of the rest of it from that around it in CIELAB, up to which the rest is ground."""
 COVER = 0.08
 """Share of the photo that all of them cover at least: knobs of a stove are not what a photo is of."""
 MARGIN = 0.08
@@ -84,27 +89,49 @@ def circles_of_a_kind(pixels: Pixels) -> list[Circle]:
     return [item for item in whole if 0.0 <= item.x < width and 0.0 <= item.y < height]
 
 
-def round_things(pixels: Pixels, seen: Sequence[Proposal], least: float) -> list[Proposal]:
+def round_things(pixels: Pixels, seen: Sequence[tuple[Mask, float]], least: float) -> list[Proposal]:
     """Return the round things of a photo ``pixels`` (H, W, 3) of many, those with most room first; empty unless it is
     one.
 
-    seen: what else stands out in it, of which nothing with a score of ``least`` or more may be much larger than they
-    are, unless it is a group of them.
+    seen: masks (h, w) on a copy of any size and scores of what else stands out in it, of which nothing with a score of
+    ``least`` or more may be much larger than they are, unless it is a group of them.
     """
     found = circles_of_a_kind(pixels)
     if not found:
         return []
-    typical = float(np.median([item.radius for item in found]))
-    for item in seen:
-        x0, y0, x1, y1 = item.box
-        held = sum(np.pi * c.radius**2 for c in found if x0 < c.x < x1 and y0 < c.y < y1)
-        area = (x1 - x0) * (y1 - y0)
-        if item.score >= least and area > 4.0 * (2.0 * typical) ** 2 and held < 0.4 * area:
-            return []
+    small = copy_of(pixels, SIDE)
+    scale = small.shape[1] / pixels.shape[1]
+    covered = np.zeros(small.shape[:2], dtype=np.uint8)
+    for item in found:
+        cv2.circle(covered, (round(item.x * scale), round(item.y * scale)), round(item.radius * scale), 1, cv2.FILLED)
+    typical = np.pi * (scale * float(np.median([item.radius for item in found]))) ** 2
+    if larger_thing_seen(seen, least, covered > 0, typical, lab_of(small)):
+        return []
     height, width = pixels.shape[:2]
     scored = [(_score(item, found, width, height), item) for item in found]
     scored.sort(key=lambda pair: (-pair[0], -pair[1].radius, pair[1].y, pair[1].x))
     return [Proposal(_box(item, width, height), score) for score, item in scored]
+
+
+def larger_thing_seen(
+    seen: Sequence[tuple[Mask, float]], least: float, covered: Mask, typical: float, lab: NDArray[np.float32]
+) -> bool:
+    """Return whether something of ``seen`` with a score of ``least`` or more is much larger than things of a kind and
+    no group of them: a coat with buttons, a shelf of balls. What is between those of a group is them or their ground.
+
+    covered: (h, w) pixels of those things on a copy of the photo. typical: area of one of them in pixels. lab: the
+    copy (h, w, 3) in CIELAB.
+    """
+    for mask, score in seen:
+        whole = cv2.resize(mask.astype(np.uint8), covered.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        if score < least or whole.sum() < LARGER * typical or (whole & covered).sum() > HELD * whole.sum():
+            continue
+        rest, around = whole & ~grown(covered, 2), ring_around(whole, 6) & ~covered
+        if not rest.any() or not around.any():
+            continue
+        if np.linalg.norm(np.median(lab[rest], axis=0) - np.median(lab[around], axis=0)) > STEP:
+            return True
+    return False
 
 
 def _score(item: Circle, found: Sequence[Circle], width: int, height: int) -> float:
