@@ -73,3 +73,16 @@ def test_four_blocks_round_things_and_tiles_to_the_border_are_not_many():
     assert blocks_of_a_kind(drawn(discs))[0] == []
     assert blocks_of_a_kind(np.full((HEIGHT, WIDTH, 3), 128, np.uint8))[0] == []
     assert blocks_of_a_kind(np.full((1, 1, 3), 128, np.uint8))[0] == []
+
+
+def test_tiles_of_a_floor_are_its_pattern():
+    """Seen at a slant, some are cut by the border, others too small."""
+    tiles = np.zeros((40 * 16, 40 * 16, 3), np.uint8)
+    rows, columns = np.mgrid[: len(tiles), : len(tiles)] // 40
+    tiles[...] = np.where(((rows + columns) % 2 == 0)[..., None], (210, 205, 200), (150, 140, 150))
+    seen = np.float32([[-120, 360], [600, 360], [400, 90], [80, 90]])
+    corners = np.float32([[0, 640], [640, 640], [640, 0], [0, 0]])
+    floor = cv2.warpPerspective(tiles, cv2.getPerspectiveTransform(corners, seen), (WIDTH, HEIGHT))
+    floor[:90] = (225, 222, 216)
+    assert blocks_of_a_kind(floor)[0] == []
+    assert alike_blocks(floor, [], 0.8) == []

@@ -193,6 +193,27 @@ def test_silver_coins_on_white_that_touch_stay_each():
     assert not (found.stay & discs[1]).any()
 
 
+def test_dominoes_that_stand_before_a_wall_stay_whole():
+    """The shadow of each reaches the next."""
+    rows = np.mgrid[:HEIGHT, :WIDTH][0]
+    picture = np.where((rows > 120)[..., None], (46.0, 48.0, 58.0), (6.0, 8.0, 9.0))
+    picture[128:140, 28:] = (8.0, 9.0, 11.0)
+    masks = []
+    for i in range(6):
+        mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        corners = [(20 + 36 * i, 70), (30 + 36 * i, 72), (28 + 36 * i, 142), (18 + 36 * i, 140)]
+        cv2.fillPoly(mask, [np.asarray(corners, np.int32)], 1)
+        masks.append(mask > 0)
+        picture[masks[-1]] = (205.0, 200.0, 182.0)
+    noise = np.random.default_rng(0).normal(scale=1.5, size=picture.shape)
+    pixels = np.clip(cv2.GaussianBlur(picture + noise, (0, 0), 0.7), 0, 255).astype(np.uint8)
+    view = camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(8.0))
+    found = unboxed_things(pixels, [masks[1], masks[4]], view)
+    for i in (0, 2, 3, 5):
+        assert (found.stay & masks[i]).sum() > 0.9 * masks[i].sum()
+    assert not found.stay[masks[1] | masks[4]].any()
+
+
 @pytest.mark.parametrize("upside_down", [True, False])
 def test_a_mirror_image_in_polished_ground_is_no_thing(upside_down):
     """A can's image in ice stayed in the photo when the can had left; another can before it stays."""

@@ -21,6 +21,8 @@ from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
 from ..lighting.ground_pixels import LUMINANCE
+from ..segmentation.alike_blocks import blocks_of_a_kind
+from ..segmentation.mask_geometry import grown
 from ..segmentation.round_things import circles_of_a_kind
 from .texture_prediction import predict_texture
 
@@ -95,15 +97,16 @@ def unboxed_things(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Cam
         if mask.any():
             _look_around(pixels, mask, objects, camera, stay, whole)
     if objects.any():
-        alike = _alike(pixels, objects)
+        alike = _alike(pixels, masks)
         stay |= alike
         whole |= alike
     return UnboxedThings(stay=stay & ~objects, whole=whole & ~objects)
 
 
-def _alike(pixels: NDArray[np.uint8], objects: Mask) -> Mask:
-    """Pixels (H, W) of the round things of a photo of many that are none of the ``objects`` (H, W). They touch, and
-    silver on white hardly differs from the ground."""
+def _alike(pixels: NDArray[np.uint8], masks: Sequence[Mask]) -> Mask:
+    """Pixels (H, W) of the round things or blocks of a photo of many that are none of the objects ``masks`` (H, W).
+    They touch, stand before a wall, and silver on white hardly differs from the ground."""
+    objects = np.logical_or.reduce(list(masks))
     rows, columns = np.mgrid[: objects.shape[0], : objects.shape[1]] + 0.5
     result = np.zeros_like(objects)
     for item in circles_of_a_kind(pixels):
@@ -111,6 +114,19 @@ def _alike(pixels: NDArray[np.uint8], objects: Mask) -> Mask:
         inner = away < item.radius
         if float((inner & objects).sum()) < BOXED * float(inner.sum()):
             result |= away < RIM * item.radius
+    if result.any():
+        return result
+    blocks, scale = blocks_of_a_kind(pixels)
+    inner = [np.zeros(objects.shape, dtype=np.uint8) for _ in blocks]
+    for drawn, block in zip(inner, blocks, strict=True):
+        cv2.drawContours(drawn, [np.rint(block.contour * scale).astype(np.int32)], -1, 1, cv2.FILLED)
+    held = [[float((drawn & mask).sum()) > BOXED * float(drawn.sum()) for drawn in inner] for mask in masks]
+    if any(sum(own) > 1 for own in held):
+        # Parts of an object, as its print, which polished ground may show once more.
+        return result
+    for k, (drawn, block) in enumerate(zip(inner, blocks, strict=True)):
+        if not any(own[k] for own in held):
+            result |= grown(drawn > 0, max(1, round((RIM - 1.0) * block.length * scale)))
     return result
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
 
 from ..reconstruct_options import Proposal
-from .mask_geometry import Mask
+from .mask_geometry import Mask, grown
 from .proposal_features import copy_of, lab_of
 from .round_things import larger_thing_seen
 
@@ -32,6 +32,8 @@ SOLID, FILLED, COARSE = 0.88, 0.85, 0.03
 """Area of a region over its convex hull's; area of the hull over the smallest rectangle's around it, or of its coarse
 polygon of four corners over its own, from which it is a quadrilateral: a circle has 0.79 and 0.64. Coarseness over the
 hull's perimeter."""
+LOOSER = 0.88
+"""Factor of both shares for what is alike to enough blocks: a highlight or a leaning side dents an outline."""
 AREA, LENGTH, WIDTH = 1.5, 1.3, 1.4
 """Largest ratios of areas, long and short sides of two blocks of a kind."""
 OVERLAP = 0.3
@@ -43,6 +45,10 @@ FEWEST = 5
 """Blocks from which a photo is one of many of a kind."""
 COVER = 0.02
 """Share of the photo that all of them cover at least."""
+COLOUR, REACH, ELSEWHERE = 6.0, 4, 0.5
+"""Difference in CIELAB from a block's median colour, and pixels around the blocks; largest area elsewhere of such
+colours over that of the blocks. Floors of six patterns had 1.8 to 7, since squares, dots and tiles go on where they are
+too small, cut or hidden; stacked blocks, dominoes and stripes of balls 0 to 0.5."""
 MARGIN = 0.06
 """Margin of a box around a block, over its longer side."""
 ROOM = 0.5
@@ -55,13 +61,15 @@ which that may rest on it; score of what carries another, which would be left in
 
 
 class Block(NamedTuple):
-    """A quadrilateral on the copy. contour: (n, 1, 2) pixels. box: x0, y0, x1, y1."""
+    """A quadrilateral on the copy. contour: (n, 1, 2) pixels. box: x0, y0, x1, y1. clear: whether it is one by itself,
+    not only beside others."""
 
     contour: NDArray[np.int32]
     area: float
     length: float
     width: float
     box: tuple[int, int, int, int]
+    clear: bool
 
 
 def _regions(small: Pixels) -> Iterator[Mask]:
@@ -88,16 +96,17 @@ def _block(mask: Mask, lab: NDArray[np.float32]) -> Block | None:
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = np.asarray(max(contours, key=cv2.contourArea), dtype=np.int32)
     area, hull = cv2.contourArea(contour), cv2.convexHull(contour)
-    if area < 20.0 or area < SOLID * cv2.contourArea(hull):
+    if area < 20.0 or area < LOOSER * SOLID * cv2.contourArea(hull):
         return None
     sides, whole = cv2.minAreaRect(hull)[1], cv2.contourArea(hull)
     corners = cv2.approxPolyDP(hull, COARSE * cv2.arcLength(hull, True), True)
     filled = max(whole / max(1.0, sides[0] * sides[1]), cv2.contourArea(corners) / whole if len(corners) == 4 else 0.0)
     x, y, across, down = cv2.boundingRect(contour)
     cut = x <= 1 or y <= 1 or x + across >= mask.shape[1] - 1 or y + down >= mask.shape[0] - 1
-    if cut or filled < FILLED or _outlined(contour, lab) < OUTLINED:
+    if cut or filled < LOOSER * FILLED or _outlined(contour, lab) < OUTLINED:
         return None
-    return Block(contour, area, max(sides), min(sides), (x, y, x + across, y + down))
+    clear = area >= SOLID * whole and filled >= FILLED
+    return Block(contour, area, max(sides), min(sides), (x, y, x + across, y + down), clear)
 
 
 def _outlined(contour: NDArray[np.int32], lab: NDArray[np.float32]) -> float:
@@ -133,18 +142,33 @@ def blocks_of_a_kind(pixels: Pixels) -> tuple[list[Block], float]:
     small = copy_of(pixels, SIDE)
     lab = lab_of(small)
     found = [item for item in (_block(mask, lab) for mask in _regions(small)) if item is not None]
-    found.sort(key=lambda item: (-item.area, item.box))
+    found.sort(key=lambda item: (not item.clear, -item.area, item.box))
     best: list[Block] = []
     for seed in found:
         kept: list[Block] = []
         for item in found:
             if _alike(seed, item) and not any(_same(item, other) for other in kept):
                 kept.append(item)
-        best = max(best, kept, key=len)
+        if sum(item.clear for item in kept) >= FEWEST:
+            best = max(best, kept, key=len)
+    best.sort(key=lambda item: (-item.area, item.box))
     covered = sum(item.area for item in best) / (small.shape[0] * small.shape[1])
-    if len(best) < FEWEST or covered < COVER:
+    if covered < COVER or _is_pattern(best, lab):
         return [], 1.0
     return best, pixels.shape[1] / small.shape[1]
+
+
+def _is_pattern(blocks: Sequence[Block], lab: NDArray[np.float32]) -> bool:
+    """Whether much of ``lab`` (h, w, 3) beside the ``blocks`` has their colours: a pattern of the ground or a wall."""
+    covered = np.zeros(lab.shape[:2], dtype=np.uint8)
+    nearest = np.full(lab.shape[:2], np.inf, dtype=np.float32)
+    for item in blocks:
+        own = np.zeros_like(covered)
+        cv2.drawContours(own, [item.contour], -1, 1, cv2.FILLED)
+        covered |= own
+        np.minimum(nearest, np.linalg.norm(lab - np.median(lab[own > 0], axis=0), axis=2), out=nearest)
+    elsewhere = (nearest < COLOUR) & ~grown(covered > 0, REACH)
+    return int(elsewhere.sum()) > ELSEWHERE * int(covered.sum())
 
 
 def alike_blocks(pixels: Pixels, seen: Sequence[tuple[Mask, float]], least: float) -> list[Proposal]:
