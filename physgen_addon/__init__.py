@@ -69,6 +69,12 @@ def registered_classes(module: ModuleType) -> list[type]:
     ]
 
 
+def _tell_in_one_line(kind: type) -> None:
+    """Join the lines of the docstring of ``kind``, which Blender shows in tooltips with all its breaks and blanks."""
+    if kind.__doc__ and "\n" in kind.__doc__:
+        kind.__doc__ = " ".join(kind.__doc__.split())
+
+
 def _hooks(module: ModuleType, prefix: str) -> list[Callable[[], None]]:
     """Return the functions of ``module`` whose names begin with ``prefix``, in order of definition."""
     return [
@@ -84,6 +90,7 @@ def register() -> None:
 
     for module in _modules():
         for kind in registered_classes(module):
+            _tell_in_one_line(kind)
             bpy.utils.register_class(kind)
         for hook in _hooks(module, "register_"):
             hook()

@@ -90,6 +90,27 @@ def state(scene: bpy.types.Scene) -> BakeState:
     return found
 
 
+UNBAKED = "Nothing moves before you press Bake"
+
+
+def unbaked(scene: bpy.types.Scene) -> str:
+    """Return in words that ``scene``, which has moving objects, is still to be baked, and when they start; or that
+    none of them will move.
+    """
+    moving = [item for item in bodies(scene) if item.physgen.role == "dynamic"]
+    is_alone = len(moving) == len(bodies(scene)) and not scene.physgen.world.effects
+    if is_alone and all(_stays(item) for item in moving):
+        return "Everything is at rest: give an object a velocity (see Motion), then Bake"
+    started = [item for item in moving if item.physgen.waits and not _stays(item)]
+    starts = [f"{item.name} at frame {item.physgen.start_frame}" for item in started]
+    return f"{UNBAKED}. Start: {', '.join(starts)}" if starts else UNBAKED
+
+
+def _stays(item: bpy.types.Object) -> bool:
+    body = item.physgen
+    return body.asleep and not (any(body.velocity) or any(body.spin) or body.pins)
+
+
 def last_seen(scene: bpy.types.Scene) -> BakeState | None:
     """Return the last observed state, or None."""
     return _known.get(scene.session_uid)

@@ -213,14 +213,20 @@ _split_off: list[int] = []
 def close_beside(scene: bpy.types.Scene) -> None:
     """Close the image editor that ``show_beside`` has opened, if it is still one; the viewport takes its place.
 
-    The photo of ``scene`` is fitted to the viewport once that has its new size.
+    In a moment: an operator that closes an editor loses what it reports. The photo of ``scene`` is fitted to the
+    viewport once that has its new size.
     """
+    if not bpy.app.background:
+        bpy.app.timers.register(functools.partial(_close_split_off, scene.session_uid), first_interval=0.1)
+
+
+def _close_split_off(uid: int) -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.as_pointer() in _split_off and area.type == "IMAGE_EDITOR" and len(window.screen.areas) > 1:
                 with bpy.context.temp_override(window=window, area=area):
                     bpy.ops.screen.area_close()
-                bpy.app.timers.register(functools.partial(_fit_again, scene.session_uid), first_interval=0.2)
+                bpy.app.timers.register(functools.partial(_fit_again, uid), first_interval=0.2)
                 break
     _split_off.clear()
 

@@ -12,7 +12,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import background_jobs, bake_state, blend_trust, paths
-from .context import redraw
+from .context import TAB, redraw
 from .playback import point_caches
 from .playback.bake_record import BAKES
 from .props.body_props import bodies
@@ -147,6 +147,38 @@ def _note_settings(scene: bpy.types.Scene) -> None:
     _settings[scene.session_uid] = mark
 
 
+def why_still(scene: bpy.types.Scene) -> str:
+    """Return why the objects of ``scene`` stand still when it is played, and what to do; empty if they move."""
+    found = bake_state.state(scene)
+    if found.status != "none" or not any(item.physgen.role == "dynamic" for item in bodies(scene)):
+        return ""
+    return f"{bake_state.unbaked(scene)} (sidebar: N, tab {TAB})"
+
+
+_told = [False]
+"""Whether the status bar tells why nothing moves."""
+
+
+@persistent
+def _on_play(scene: bpy.types.Scene, *_: Any) -> None:
+    why = "" if bpy.app.background else why_still(scene)
+    if why:
+        _told[0] = True
+        _set_status(why)
+
+
+@persistent
+def _on_stop(*_: Any) -> None:
+    if _told[0]:
+        _told[0] = False
+        _set_status(None)
+
+
+def _set_status(words: str | None) -> None:
+    for window in bpy.context.window_manager.windows:
+        window.workspace.status_text_set(words)
+
+
 def _is_playing() -> bool:
     """Return whether an animation is playing: no check is worth a dropped frame."""
     return any(window.screen.is_animation_playing for window in bpy.context.window_manager.windows)
@@ -234,6 +266,8 @@ def _after_save(path: str = "", *_: Any) -> None:
 
 HANDLERS = {
     "depsgraph_update_post": _on_change,
+    "animation_playback_pre": _on_play,
+    "animation_playback_post": _on_stop,
     "undo_post": _on_undo,
     "redo_post": _on_history,
     "load_post": _on_load,

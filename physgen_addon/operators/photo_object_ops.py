@@ -45,13 +45,25 @@ def add_found(scene: bpy.types.Scene, found: list[Proposal], *, every: bool) -> 
     chosen = range(len(found)) if every else best_proposals(found)
     added = 0
     for index in chosen:
-        box = found[index].box
-        there = [(other.x0, other.y0, other.x1, other.y1) for other in state.boxes]
-        if all(box_overlap(box, other) < SAME for other in there):
-            x0, y0, x1, y1 = (round(value) for value in box)
+        if _is_new(state, found[index]):
+            x0, y0, x1, y1 = (round(value) for value in found[index].box)
             add_box(scene, (x0, y0, x1, y1))
             added += 1
     return added
+
+
+def _is_new(state: bpy.types.PropertyGroup, item: Proposal) -> bool:
+    there = [(other.x0, other.y0, other.x1, other.y1) for other in state.boxes]
+    return all(box_overlap(item.box, other) < SAME for other in there)
+
+
+def found_words(scene: bpy.types.Scene, found: list[Proposal], added: int) -> str:
+    """Return the report of the objects ``found``, of which as many as ``added`` have just got a box."""
+    if not found:
+        return "Nothing stands out in this photo: draw a box around each object"
+    rest = sum(_is_new(scene.physgen_photo, item) for item in found)
+    more = f"; All adds {rest} more" if rest else ""
+    return f"{count(added, 'box')} added{more}. Name them, then Reconstruct"
 
 
 class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
@@ -73,7 +85,7 @@ class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
         return super().poll(context)
 
     def request(self, context: bpy.types.Context) -> Work:
-        """Return the search as a child process; its numbered picture lies beside the scene folder."""
+        """Return the search as a child process, which writes beside the scene folder."""
         state = context.scene.physgen_photo
         path, scene = photo_file(state), scene_folder(state)
         if not path.is_file():
@@ -94,8 +106,7 @@ class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
             found.append(Proposal((x0, y0, x1, y1), float(item["score"])))
         added = add_found(scene, found, every=self.every)
         redraw("IMAGE_EDITOR")
-        words = f"{count(len(found), 'object')} found, {count(added, 'box')} added"
-        return f"{words}; {Path(str(final['out'])).name} has a numbered picture"
+        return found_words(scene, found, added)
 
 
 DIM = 0.2

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import EnumProperty, StringProperty
 
 from ...sim.errors import InputError
 from ..context import TAB, active, show_beside
@@ -54,6 +54,8 @@ class PHYSGEN_OT_open_photo(bpy.types.Operator):
 
     filepath: StringProperty(name="Photo", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    # As Blender's file browser knows it: 3 are thumbnails.
+    display_type: EnumProperty(items=[("THUMBNAIL", "Thumbnails", "", 3)], options={"HIDDEN", "SKIP_SAVE"})
 
     @report_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -167,6 +169,8 @@ def unregister_photo_menu() -> None:
 
 
 CHOSEN, OTHER, DRAGGED = (1.0, 0.55, 0.1, 1.0), (1.0, 1.0, 1.0, 0.8), (1.0, 0.8, 0.2, 1.0)
+UNDER = (0.0, 0.0, 0.0, 0.7)
+"""Below lines and names, which are else lost on photos of their own colour."""
 _dragged: list[tuple[int, int, int, int]] = []
 """The rectangle being dragged, at most one; not stored in any file."""
 _handlers: list[Any] = []
@@ -264,20 +268,24 @@ def _draw_boxes() -> None:
     ]
     lines += [(corners, DRAGGED, "") for corners in _dragged]
     gpu.state.blend_set("ALPHA")
-    gpu.state.line_width_set(2.0 * scale)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, 3, *UNDER)
     for (x0, y0, x1, y1), colour, name in lines:
         places = [
             on_screen(context.region, x / state.width, y / state.height)
             for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
         ]
-        shader.uniform_float("color", colour)
-        batch_for_shader(shader, "LINE_LOOP", {"pos": [(*place, 0.0) for place in places]}).draw(shader)
+        for drawn, width in ((UNDER, 4.0), (colour, 2.0)):
+            gpu.state.line_width_set(width * scale)
+            shader.uniform_float("color", drawn)
+            batch_for_shader(shader, "LINE_LOOP", {"pos": [(*place, 0.0) for place in places]}).draw(shader)
         if name:
             top = max(place.y for place in places)
             blf.size(0, 12.0 * scale)
             blf.color(0, *colour)
             blf.position(0, min(place.x for place in places), top + 4 * scale, 0)
             blf.draw(0, name)
+    blf.disable(0, blf.SHADOW)
     gpu.state.line_width_set(1.0)
     gpu.state.blend_set("NONE")
 

@@ -109,6 +109,10 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         """Open the scene folder and reapply the user's edits of an earlier one; show the estimated horizon."""
         root, photo = Path(str(final["scene"])), photo_file(scene.physgen_photo)
         changed = find_edits(scene, photo)
+        if clip := final.get("clip"):
+            # The length and slow motion that suit the chosen motion. Imported times become frames by them.
+            simulation = scene.physgen.simulation
+            simulation.frame_end, simulation.slow = simulation.frame_start + clip["frames"] - 1, clip["slow"]
         sentence = show_scene(scene, root)
         close_beside(scene)
         # Undo may have cleared what was chosen at the start; what has been chosen since counts.
@@ -116,10 +120,6 @@ class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
         remember_imported(scene, photo)
         restore_edits(scene, changed)
         take_camera(scene.physgen_photo, load_scene(root).model.camera)
-        if clip := final.get("clip"):
-            # The length and slow motion that suit the chosen motion.
-            simulation = scene.physgen.simulation
-            simulation.frame_end, simulation.slow = simulation.frame_start + clip["frames"] - 1, clip["slow"]
         return sentence
 
 

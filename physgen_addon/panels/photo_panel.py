@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import bpy
@@ -29,6 +30,7 @@ from ..operators.photo_ops import (
 )
 from ..operators.reconstruct_ops import PHYSGEN_OT_open_photo_report, PHYSGEN_OT_reconstruct
 from ..photo.photo_consent import OFFLINE, is_allowed
+from ..photo.photo_image import tool_help
 from ..photo.photo_request import made_folder, scene_folder
 from ..props.preferences import python
 from .sidebar import draw_job, optional
@@ -244,7 +246,9 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
         buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
         buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
     else:
-        text.sentences(layout, context, "Draw a box around each object that is to move.")
+        text.sentences(layout, context, "Draw a box around each object that is to move, or let them be found.")
+    if tool_help():
+        text.sentences(layout, context, tool_help(), icon="INFO")
     row = layout.row()
     row.scale_y = 1.0 if state.boxes else 1.4
     row.operator(PHYSGEN_OT_draw_box.bl_idname, icon="SELECT_SET")
@@ -254,11 +258,19 @@ def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: b
     if not 0 <= state.box_index < len(state.boxes):
         return
     box = state.boxes[state.box_index]
+    if not box.kind.strip() and is_unnamed(box):
+        words = "Double-click the name and write what it is, such as orange: that sets material and size."
+        text.sentences(layout, context, words)
     column = layout.column(align=True)
     column.use_property_split, column.use_property_decorate = True, False
     optional(column, box, "knows_size", "size_m", "Size", otherwise="Estimated")
     if not any(other.size_m > 0 for other in state.boxes):
         text.sentences(layout, context, "Tick Size and enter it for one object; otherwise the scale is estimated.")
+
+
+def is_unnamed(box: bpy.types.PropertyGroup) -> bool:
+    """Return whether ``box`` has the name that it began with."""
+    return re.fullmatch(r"object \d+", box.name) is not None
 
 
 def _beside() -> str:

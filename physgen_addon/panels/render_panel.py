@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from .. import blend_trust, text
@@ -12,11 +10,7 @@ from ..background_jobs import running
 from ..operators.export_ops import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_usd, PHYSGEN_OT_make_independent
 from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command, written
 from ..operators.render_ops import PHYSGEN_OT_look_nodes, PHYSGEN_OT_render_still, PHYSGEN_OT_render_video
-from ..render.render_options import VIDEO_CODECS
-from .sidebar import RENDER, Sidebar, draw_job, optional
-
-RESULTS = (".png", ".exr", *VIDEO_CODECS)
-"""Suffixes of rendered files."""
+from .sidebar import RENDER, Sidebar, draw_job, draw_result, optional
 
 
 class PHYSGEN_PT_render(Sidebar, bpy.types.Panel):
@@ -60,21 +54,7 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     row.scale_y = 1.4
     row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
     row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
-    _draw_result(layout, rendering)
-
-
-def _draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup) -> None:
-    if not rendering.result or blend_trust.is_pending(rendering.result):
-        return
-    path = Path(bpy.path.abspath(rendering.result))
-    # A .blend from elsewhere may set any path here, and Open passes it to the operating system.
-    if not blend_trust.may_open(path, RESULTS):
-        return
-    row = layout.row(align=True)
-    row.label(text=path.name, icon="CHECKMARK")
-    row.operator("wm.path_open", text="Open").filepath = str(path)
-    if blend_trust.may_open(path.parent):
-        row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
+    draw_result(layout, rendering)
 
 
 def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

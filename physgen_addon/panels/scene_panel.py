@@ -26,6 +26,7 @@ from .sidebar import (
     draw_bake_button,
     draw_missing_python,
     draw_progress,
+    draw_result,
     draw_trouble,
     draw_trust,
 )
@@ -74,6 +75,8 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
             draw_bake_button(layout, found.status)
             if found.status == "stale":
                 text.sentences(layout, context, found.advice, icon="ERROR")
+            elif found.status == "none":
+                text.sentences(layout, context, bake_state.unbaked(scene), icon="INFO")
         return
     shows_photo = not context.scene.physgen.folder and context.scene.physgen_photo.image is not None
     if shows_photo and job.title in photo_panel.JOBS:
@@ -94,6 +97,7 @@ def _draw_baked(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row.operator("screen.animation_play", text="Stop" if plays else "Play", icon="PAUSE" if plays else "PLAY")
     if context.scene.physgen.folder:
         row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
+        draw_result(layout, context.scene.physgen.rendering)
 
 
 def _draw_beginning(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

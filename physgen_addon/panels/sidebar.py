@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -16,6 +17,7 @@ from ..preview import live_preview
 from ..preview.live_preview import PHYSGEN_OT_toggle_preview
 from ..props.body_props import is_body
 from ..props.preferences import PHYSGEN_AP_preferences, python
+from ..render.render_options import VIDEO_CODECS
 
 SCENE, OBJECTS, MOTION, SIMULATE, RENDER, WORLD, COMPOSE, DIAGNOSE = range(8)
 """``bl_order``: the order of a first visit, so that Bake is in sight; what few need comes last."""
@@ -26,6 +28,10 @@ BAKE_ICONS = {"paused": "PLAY", "none": "PHYSICS"}
 
 COMMAND = f" In {TERMINAL}:"
 """Prefix of the command that installs missing packages (``interpreter``)."""
+
+
+RESULTS = (".png", ".exr", *VIDEO_CODECS)
+"""Suffixes of rendered files."""
 
 
 class Sidebar:
@@ -112,6 +118,21 @@ def draw_bake_button(layout: bpy.types.UILayout, status: str, *, ready: bool = T
     row.operator(bake_state.BAKE_OPERATOR, text=label, icon=icon)
 
 
+def draw_result(layout: bpy.types.UILayout, rendering: bpy.types.PropertyGroup) -> None:
+    """Draw the name of what was rendered last, and buttons that open it and its folder."""
+    if not rendering.result or blend_trust.is_pending(rendering.result):
+        return
+    path = Path(bpy.path.abspath(rendering.result))
+    # A .blend from elsewhere may set any path here, and Open passes it to the operating system.
+    if not blend_trust.may_open(path, RESULTS):
+        return
+    row = layout.row(align=True)
+    row.label(text=path.name, icon="CHECKMARK")
+    row.operator("wm.path_open", text="Open").filepath = str(path)
+    if blend_trust.may_open(path.parent):
+        row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(path.parent)
+
+
 def draw_trust(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw what somebody else's file asks for, and the way to agree to it; nothing where nothing waits."""
     waiting = len(blend_trust.pending(context.scene))
@@ -153,9 +174,18 @@ def draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, job: J
     row = column.row(align=True)
     row.scale_y = 1.4
     row.progress(factor=job.fraction or 0.0, text=progress_text(job))
-    if job.message:
-        text.sentences(column, context, job.message)
+    words = job.message or _frames_done(job)
+    if words:
+        text.sentences(column, context, words)
     return row
+
+
+def _frames_done(job: Job) -> str:
+    """Return how far a job of frames is, in words; a line that stays, so that what is below it does not jump."""
+    if job.stage not in ("bake", "render") or job.done is None:
+        return ""
+    words = f"Frame {job.done} of {job.total}"
+    return f"{words}; Space plays them" if job.stage == "bake" and job.done > 0 else words
 
 
 NOTICE = 120

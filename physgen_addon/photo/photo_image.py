@@ -305,12 +305,21 @@ ENDING = ("RET", "NUMPAD_ENTER", "ESC", "RIGHTMOUSE")
 """Keys and buttons that end a tool."""
 
 
+_help: list[str] = []
+"""Of the tool that is in use, at most one."""
+
+
+def tool_help() -> str:
+    """Return how to use and end the tool that works over the photo now, in sentences; empty if there is none."""
+    return ". ".join(_help[0].split("    ")) if _help else ""
+
+
 class PhotoTool(OperatorMixin):
     """Mixin of modal operators that work over the photo in the image editor: enabled while it is visible, with a cursor
     and a line of help until Enter, Esc, the right button or a click outside the photo ends it.
 
-    tool_cursor: one of Blender's cursors. tool_help: shown in the status bar. tool_box: index of the box that it
-    changes; None for none.
+    tool_cursor: one of Blender's cursors. tool_help: shown in the status bar and the panel. tool_box: index of the box
+    that it changes; None for none.
     """
 
     tool_cursor = "CROSSHAIR"
@@ -336,7 +345,9 @@ class PhotoTool(OperatorMixin):
         context.window.cursor_modal_set(self.tool_cursor)
         context.workspace.status_text_set(self.tool_help)
         context.window_manager.modal_handler_add(self)
-        redraw("IMAGE_EDITOR")
+        _help[:] = [self.tool_help]
+        for editor in ("IMAGE_EDITOR", "VIEW_3D"):
+            redraw(editor)
         return {"RUNNING_MODAL"}
 
     def photo_state(self) -> bpy.types.PropertyGroup | None:
@@ -380,6 +391,7 @@ class PhotoTool(OperatorMixin):
     def end(self, context: bpy.types.Context, how: str) -> set[str]:
         """Give cursor and status bar back; return the result ``how``, FINISHED or CANCELLED, of ``modal``."""
         self.forget()
+        _help.clear()
         context.window.cursor_modal_restore()
         context.workspace.status_text_set(None)
         for editor in ("IMAGE_EDITOR", "VIEW_3D"):

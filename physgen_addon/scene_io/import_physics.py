@@ -110,9 +110,10 @@ def fill_body(
             _animate_places(pin, source.pin_motion, first, rate)
     if source.pin_motion and not source.pins:
         notes.append(f"{source.name} is held along a path in the folder; here it is held in place")
-    for field, what in (("acceleration", "an acceleration"), ("velocity_keys", "velocities")):
-        if getattr(source, field):
-            notes.append(f"{source.name} has {what} over time in the folder; here it has none")
+    if source.acceleration:
+        notes.append(f"{source.name} has an acceleration over time in the folder; here it has none")
+    if source.velocity_keys:
+        notes.append(f"{source.name} is pushed again later in the folder; here it is only at its start")
     if source.material_tracks:
         changing = ", ".join(track.field for track in source.material_tracks)
         notes.append(f"{source.name} has {changing} over time in the folder; here they stay")

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from pathlib import PurePosixPath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from physgen.physgen_addon.operators.photo_ops import (
     add_box,
     set_photo,
 )
+from physgen.physgen_addon.operators.reconstruct_ops import PHYSGEN_OT_reconstruct
 from physgen.physgen_addon.photo.photo_image import load_photo_image
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.material_props import get_material
@@ -467,6 +469,25 @@ def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
     assert max(item.dimensions) == pytest.approx(0.1, rel=0.01)
     assert load_scene(tmp_path / "ball_scene").model.objects[0].name == item.physgen.source
     assert (scene.render.resolution_x, scene.render.resolution_y) == (160, 120)
+
+
+def test_a_reconstructed_motion_starts_at_the_frames_of_its_own_slow_motion(copy):
+    """Twice slower, 0.5 s after the beginning is frame 25 of 24 a second, also at the first reconstruction."""
+    scene = bpy.context.scene
+    changed(copy, start_time=0.5, velocity=(0.0, 0.0, 1.0))
+    set_photo(scene, copy.file("photo.png"))
+    assert scene.physgen.simulation.slow == 1.0
+    final = {"scene": str(copy.root), "materials": {}, "clip": {"frames": 108, "slow": 2.0}}
+    words = PHYSGEN_OT_reconstruct.finished(SimpleNamespace(), scene, final)
+    body = scene.physgen.photo_root.objects["ball"].physgen
+    assert (body.start_frame, scene.physgen.simulation.frame_end) == (25, 108)
+    assert words.startswith("1 object imported")
+
+
+def test_a_second_push_of_an_object_is_reported_as_what_it_is(copy):
+    folder = changed(copy, velocity=(0.0, 0.0, 1.0), velocity_keys=(Key(time_s=1.0, value=(0.1, 0.0, 0.0)),))
+    notes = bridge.import_notes(bridge.import_scene(bpy.context.scene, folder.root))
+    assert "ball is pushed again later in the folder; here it is only at its start" in notes
 
 
 def test_an_output_folder_of_physgen3d_becomes_a_scene_in_the_worker(world, tmp_path):

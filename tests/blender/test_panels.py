@@ -62,6 +62,22 @@ def test_every_property_has_a_description():
                 assert found.description or found.type == "POINTER" or name.endswith(("_index", "switch", "pin_index"))
 
 
+def test_tooltips_are_one_paragraph_without_a_full_stop():
+    """Blender adds the full stop, below a break where a docstring ends with one."""
+    told = [item for item in dir(bpy.ops.physgen) if not item.startswith("_")]
+    assert len(told) > 40
+    for name in told:
+        words = getattr(bpy.ops.physgen, name).get_rna_type().description
+        assert words and "\n" not in words and not words.endswith((".", " ")), name
+
+
+def test_photos_are_chosen_by_thumbnail():
+    """Blender's file browser takes the number, whatever it is called."""
+    (shown,) = bpy.ops.physgen.open_photo.get_rna_type().properties["display_type"].enum_items
+    params = bpy.types.FileSelectParams.bl_rna.properties["display_type"].enum_items
+    assert shown.value == params["THUMBNAIL"].value
+
+
 # -- the list of bodies -----------------------------------------------------------------------------------------------
 
 

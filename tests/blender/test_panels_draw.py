@@ -12,9 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen import physgen_addon
-from physgen.physgen_addon import background_jobs, bake_state, text
+from physgen.physgen_addon import background_jobs, bake_state, handlers, text
+from physgen.physgen_addon.context import TAB
+from physgen.physgen_addon.operators.photo_object_ops import add_found, found_words
+from physgen.physgen_addon.operators.photo_ops import add_box
 from physgen.physgen_addon.panels import sidebar, simulate_panel
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS
+from physgen.sim.reconstruct.reconstruct_options import Proposal
 
 from . import checked_layout
 
@@ -177,6 +181,54 @@ def test_the_first_panel_says_what_comes_after_a_bake(monkeypatch, tmp_path):
     assert "screen.animation_play" not in shown.names
 
 
+def test_the_first_panel_says_what_to_do_before_a_bake():
+    """A motion that begins later, or not at all, is said too: played, both look as if nothing worked."""
+    item = a_body()
+    scene = bpy.context.scene
+    assert bake_state.UNBAKED in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
+    assert bake_state.UNBAKED in handlers.why_still(scene) and TAB in handlers.why_still(scene)
+    item.physgen.velocity, item.physgen.start_frame = (0.0, 0.0, 1.0), 23
+    assert f"{item.name} at frame 23" in bake_state.unbaked(scene)
+    item.physgen.velocity, item.physgen.asleep = (0.0, 0.0, 0.0), True
+    assert "Everything is at rest" in bake_state.unbaked(scene)
+    bpy.ops.physgen.add_stack_effect(effect="wind")
+    assert bake_state.UNBAKED in bake_state.unbaked(scene)
+
+
+def test_nothing_is_said_of_objects_that_move_or_take_no_part(monkeypatch):
+    scene = bpy.context.scene
+    assert handlers.why_still(scene) == ""
+    a_body()
+    assert handlers.why_still(scene)
+    scene_panel(monkeypatch, "baked")
+    assert handlers.why_still(scene) == ""
+
+
+def test_what_was_rendered_is_opened_where_render_video_was_pressed(monkeypatch, tmp_path):
+    """The panel Render is closed until somebody opens it."""
+    a_body()
+    scene = bpy.context.scene
+    scene.physgen.folder, video = str(tmp_path), tmp_path / "video.mp4"
+    assert "wm.path_open" not in scene_panel(monkeypatch, "baked").names[:3]
+    video.touch()
+    scene.physgen.rendering.result = str(video)
+    shown = scene_panel(monkeypatch, "baked")
+    assert "video.mp4" in shown.words and "wm.path_open" in shown.names[:3]
+
+
+@pytest.mark.parametrize(
+    ("stage", "done", "words"),
+    [("bake", 40, "Frame 40 of 108; Space plays them"), ("render", 0, "Frame 0 of 108"), ("fits", 3, "")],
+)
+def test_a_job_of_frames_says_which_it_is_at(stage, done, words):
+    """Also so that the panels below it stay where they are once there is no message."""
+    job = background_jobs.Job("Job", lambda on_event, cancelled: {})
+    job._take({"event": "progress", "stage": stage, "done": done, "total": 108})
+    layout = checked_layout.CheckedLayout()
+    sidebar.draw_progress(layout, checked_layout.Context(), job)
+    assert " ".join(layout.words[1:]) == words
+
+
 def test_a_bake_is_paused_and_other_jobs_are_cancelled():
     """Both would do the same to a bake."""
     a_body()
@@ -317,6 +369,28 @@ def test_a_photo_is_drawn_with_its_boxes():
     # What comes next is above what few need.
     assert names.index("PHYSGEN_UL_boxes") < names.index("physgen.reconstruct") < names.index("output")
     assert len(draw_every_choice(photo)) > 5
+
+
+def test_a_box_that_has_no_name_yet_is_to_get_one():
+    bpy.ops.physgen.open_photo(filepath=str(COFFEE))
+    scene = bpy.context.scene
+    box = add_box(scene, (10, 10, 200, 200))
+    assert "write what it is" in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
+    box.name = "cup"
+    assert "write what it is" not in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
+    box.name, box.kind = "object 1", "cup"
+    assert "write what it is" not in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
+
+
+def test_found_objects_are_reported_by_what_to_do_next():
+    bpy.ops.physgen.open_photo(filepath=str(COFFEE))
+    scene = bpy.context.scene
+    found = [Proposal((10, 10, 200, 200), 0.9), Proposal((300, 200, 500, 390), 0.4)]
+    assert found_words(scene, [], 0).startswith("Nothing stands out")
+    add_box(scene, (10, 10, 200, 200))
+    assert found_words(scene, found, 1) == "1 box added; All adds 1 more. Name them, then Reconstruct"
+    assert add_found(scene, found, every=True) == 1
+    assert found_words(scene, found, 1) == "1 box added. Name them, then Reconstruct"
 
 
 def test_every_popup_is_drawn():

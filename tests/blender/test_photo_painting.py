@@ -21,12 +21,14 @@ from physgen.physgen_addon.operators.photo_ops import (
     add_box,
     set_photo,
 )
+from physgen.physgen_addon.panels.scene_panel import PHYSGEN_PT_scene
 from physgen.physgen_addon.photo.photo_image import (
     PhotoTool,
     first_mask,
     mask_size,
     read_mask_image,
     store_mask,
+    tool_help,
     widen,
     write_masks,
 )
@@ -40,6 +42,8 @@ from physgen.physgen_addon.photo.photo_request import (
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.reconstruct_options import Proposal
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
+
+from . import checked_layout
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -418,6 +422,9 @@ def test_found_objects_become_boxes_once(photo):
 def test_boxes_are_drawn_one_after_the_other(window, photo):
     operator = operate(PHYSGEN_OT_draw_box)
     operator.invoke(window, event("NONE"))
+    # The panel says it, because the status bar is far from where one looks.
+    said = "Drag a box around each object. Enter, Esc, right click: done"
+    assert tool_help() == said and said in " ".join(checked_layout.draw(PHYSGEN_PT_scene).words)
     modal, before = partial(operator.modal, window), len(photo.boxes)
     for u in (0.1, 0.5):
         assert modal(event("LEFTMOUSE", u, 0.2)) == {"RUNNING_MODAL"}
@@ -428,7 +435,7 @@ def test_boxes_are_drawn_one_after_the_other(window, photo):
     # A click without a drag is no box.
     modal(event("LEFTMOUSE", 0.5, 0.5))
     modal(event("LEFTMOUSE", 0.5, 0.5, "RELEASE"))
-    assert modal(event("RET")) == {"FINISHED"}
+    assert modal(event("RET")) == {"FINISHED"} and tool_help() == ""
     drawn = [(box.x0, box.y0, box.x1, box.y1) for box in list(photo.boxes)[before:]]
     assert drawn == [(32, 48, 96, 96), (160, 48, 224, 96)]
 

@@ -13,7 +13,7 @@ from physgen.batch.commands.render_commands import render_options
 from physgen.batch.render import build_parser
 from physgen.physgen_addon import interpreter, paths
 from physgen.physgen_addon.operators import render_ops
-from physgen.physgen_addon.panels.render_panel import RESULTS
+from physgen.physgen_addon.panels.sidebar import RESULTS
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS, effect_values
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.sim.effects.registry import effect
