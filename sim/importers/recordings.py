@@ -267,44 +267,20 @@ def _read_tracker(path: Path, text: str) -> RecordedTable:
     except ElementTree.ParseError as error:
         raise InputError(f"{path}: not a Tracker project ({error})") from None
 
-    def objects(name: str) -> list[ElementTree.Element]:
-        return [o for o in root.iter("object") if (o.get("class") or "").endswith(name)]
-
-    def number(item: ElementTree.Element, name: str, default: float | None = None) -> float:
-        for entry in item.findall("property"):
-            if entry.get("name") == name and entry.text:
-                try:
-                    value = float(entry.text)
-                except ValueError:
-                    break
-                if math.isfinite(value):
-                    return value
-                raise InputError(f"{path}: {name} is {value} in {item.get('class')}; track it again")
-        if default is None:
-            raise InputError(f"{path}: {name} is missing in {item.get('class')}")
-        return default
-
-    masses = objects("tracker.PointMass")
-    frames = [o for c in objects("ImageCoordSystem") for o in c.iter("object") if "FrameData" in (o.get("class") or "")]
+    masses, clocks = _of_class(root, "tracker.PointMass"), _of_class(root, "ClipControl")
+    systems = [item for found in _of_class(root, "ImageCoordSystem") for item in found.iter("object")]
+    frames = [item for item in systems if "FrameData" in (item.get("class") or "")]
     if not masses or not frames:
         raise InputError(f"{path}: has no point mass or no coordinate system; track one in Tracker and save again")
     system = frames[0]
-    scale, tilt = number(system, "xscale"), math.radians(number(system, "angle", 0.0))
-    origin = np.array([number(system, "xorigin"), number(system, "yorigin")])
+    scale, tilt = _property(path, system, "xscale"), math.radians(_property(path, system, "angle", 0.0))
+    origin = np.array([_property(path, system, "xorigin"), _property(path, system, "yorigin")])
     if not scale > 0:
         raise InputError(f"{path}: xscale is {scale!r} pixels per unit: calibrate in Tracker")
-    step_ms = number(objects("ClipControl")[0], "delta_t", 0.0) if objects("ClipControl") else 0.0
+    step_ms = _property(path, clocks[0], "delta_t", 0.0) if clocks else 0.0
     if not step_ms > 0:
         raise InputError(f"{path}: delta_t, the time of a frame in ms, is missing")
-    tracks: dict[str, dict[int, tuple[float, float]]] = {}
-    for item in masses:
-        name = next((e.text for e in item.findall("property") if e.get("name") == "name" and e.text), "mass")
-        own = tracks.setdefault(name, {})
-        for entry in item.findall("property[@name='framedata']/property"):
-            index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name") or "")
-            data = entry.find("object")
-            if index is not None and data is not None:
-                own[int(index[1])] = (number(data, "x"), number(data, "y"))
+    tracks = _tracks(path, masses)
     order = sorted({frame for own in tracks.values() for frame in own})
     if len(order) < 3:
         raise InputError(f"{path}: {len(order)} frames are tracked; a motion needs at least 3")
@@ -330,3 +306,38 @@ def _read_tracker(path: Path, text: str) -> RecordedTable:
         length_unit="m",
         planar=True,
     )
+
+
+def _of_class(root: ElementTree.Element, name: str) -> list[ElementTree.Element]:
+    """The objects of a Tracker project whose class ends in ``name``."""
+    return [item for item in root.iter("object") if (item.get("class") or "").endswith(name)]
+
+
+def _property(path: Path, item: ElementTree.Element, name: str, default: float | None = None) -> float:
+    """The number ``name`` of an object of the project ``path``. Raises InputError without it and a ``default``."""
+    for entry in item.findall("property"):
+        if entry.get("name") == name and entry.text:
+            try:
+                value = float(entry.text)
+            except ValueError:
+                break
+            if math.isfinite(value):
+                return value
+            raise InputError(f"{path}: {name} is {value} in {item.get('class')}; track it again")
+    if default is None:
+        raise InputError(f"{path}: {name} is missing in {item.get('class')}")
+    return default
+
+
+def _tracks(path: Path, masses: list[ElementTree.Element]) -> dict[str, dict[int, tuple[float, float]]]:
+    """The place in pixels of each point mass in each frame where it is tracked, by name."""
+    tracks: dict[str, dict[int, tuple[float, float]]] = {}
+    for item in masses:
+        name = next((e.text for e in item.findall("property") if e.get("name") == "name" and e.text), "mass")
+        own = tracks.setdefault(name, {})
+        for entry in item.findall("property[@name='framedata']/property"):
+            index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name") or "")
+            data = entry.find("object")
+            if index is not None and data is not None:
+                own[int(index[1])] = (_property(path, data, "x"), _property(path, data, "y"))
+    return tracks

@@ -119,21 +119,7 @@ def follow_plain_body(
     noise_of_centre = _centre_noise(body, view, clock[free], path_px[free], None if box is None else box.at(free))
     turns = None if box is None else box.turns[kept]
     trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre, turns)
-    capture = check_capture(
-        Capture(
-            gravity=(0.0, 0.0, -9.81),
-            ground=Ground(
-                point=tuple(float(v) for v in view.point),  # type: ignore[arg-type]
-                normal=tuple(float(v) for v in view.normal),  # type: ignore[arg-type]
-                friction=body.friction,
-                restitution=body.restitution,
-            ),
-            objects=(item,),
-            noise_sigma=noise,
-            camera=None,
-            trials=(trial,),
-        )
-    )
+    capture = _capture(body, item, view, trial, noise)
     for message in (*view.notes, *warnings):
         progress.notice(f"{path.name}: {message}")
     return VideoMotion(
@@ -178,6 +164,26 @@ def _found_regions(video: VideoTrial, steps: int, progress: StageProgress, cance
             f"{video.path}: {len(found.stamps)} frames could be read; a motion needs {LEAST_FRAMES}: give a longer part"
         )
     return found
+
+
+def _capture(body: BodyRequest, item: CaptureObject, view: MotionView, trial: Trial, noise: float) -> Capture:
+    """The capture of one ``trial`` of ``item`` over the ground that ``view`` found."""
+    ground = Ground(
+        point=tuple(float(v) for v in view.point),  # type: ignore[arg-type]
+        normal=tuple(float(v) for v in view.normal),  # type: ignore[arg-type]
+        friction=body.friction,
+        restitution=body.restitution,
+    )
+    return check_capture(
+        Capture(
+            gravity=(0.0, 0.0, -9.81),
+            ground=ground,
+            objects=(item,),
+            noise_sigma=noise,
+            camera=None,
+            trials=(trial,),
+        )
+    )
 
 
 def _followed(video: VideoTrial, body: BodyRequest, found: MovingRegions, fps: float) -> _Followed:
