@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
-from . import background_jobs, bake_state, blend_trust, paths
+from . import background_jobs, bake_state, blend_trust, paths, unsaved_bakes
 from .context import TAB, redraw
 from .playback import point_caches
 from .playback.bake_record import BAKES
@@ -210,7 +210,7 @@ def _on_load(*_: Any) -> None:
     bake_state.forget()
     _settings.clear()
     paths.new_unsaved_key()
-    bake_state.forget_unsaved()
+    unsaved_bakes.forget_unsaved()
     for scene in bpy.data.scenes:
         _find_by_modifiers(scene)
     bake_state.mark_dirty()
@@ -251,7 +251,7 @@ def _find_by_modifiers(scene: bpy.types.Scene) -> None:
 def _before_save(path: str = "", *_: Any) -> None:
     # Empty for the start-up file.
     if path:
-        bake_state.before_first_save(path)
+        unsaved_bakes.before_first_save(path)
         remember_folders(path)
 
 
@@ -259,7 +259,7 @@ def _before_save(path: str = "", *_: Any) -> None:
 def _after_save(path: str = "", *_: Any) -> None:
     if path:
         restore_folders(path)
-        bake_state.after_first_save(path)
+        unsaved_bakes.after_first_save(path)
         blend_trust.note_saved()
         bake_state.mark_dirty()
 

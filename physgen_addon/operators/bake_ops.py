@@ -14,7 +14,7 @@ from ...sim.cache.bake_folder import load_manifest
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent
 from ...sim.scene.folder import load_scene
-from .. import background_jobs, bake_state, paths
+from .. import background_jobs, bake_state, paths, unsaved_bakes
 from ..background_jobs import Job, JobOperator, Work
 from ..interpreter import bake_command, cli_command, find_python
 from ..playback import bake_record, show_bake
@@ -197,7 +197,7 @@ class Bake(JobOperator):
         ends = self._is_first and scene.frame_end > last and not _animated_after(last)
         scene.frame_end = last if ends else max(scene.frame_end, last)
         waits = paths.is_unsaved_cache(scene)
-        bake_state.settle(scene)
+        unsaved_bakes.settle(scene)
         bake_state.observe(scene)
         sentence = f"Baked frames {record.frame_start} to {last}"
         if ends:
@@ -209,7 +209,7 @@ class Bake(JobOperator):
     def stopped(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
         """Keep the available frames playable."""
         bake_state.set_trouble(scene, "" if isinstance(error, Cancelled) else str(error))
-        bake_state.settle(scene)
+        unsaved_bakes.settle(scene)
         bake_state.refresh(scene)
 
 

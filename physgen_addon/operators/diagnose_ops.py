@@ -20,7 +20,7 @@ from ..context import look_through_camera, turn_to, viewports
 from ..interpreter import cli_command, find_python
 from ..paths import folder_beside, free_folder, require_file, require_folder, stored
 from ..playback import capture_scene, capture_view
-from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
+from ..playback.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from ..props.body_props import is_body
 from ..props.diagnose_props import apply_view, clear_diagnosis, fill_diagnosis
 from ..props.preferences import python

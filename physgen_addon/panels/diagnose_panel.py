@@ -20,7 +20,7 @@ from ..operators.diagnose_ops import (
     PHYSGEN_OT_open_report,
 )
 from ..operators.effect_ops import PHYSGEN_OT_add_effect, PHYSGEN_OT_clear_overlay, PHYSGEN_OT_show_overlay
-from ..playback.capture_scene import FOUND, LAYERS, NOMINAL, OBSERVED
+from ..playback.capture_materials import FOUND, LAYERS, NOMINAL, OBSERVED
 from .sidebar import DIAGNOSE, Sidebar, draw_job, optional
 
 WORTH_SAYING = 0.01

@@ -14,14 +14,14 @@ from mathutils import Vector
 from ...sim.cache.bake_folder import Bake
 from ...sim.scene.folder import Scene
 from ...sim.scene.meshes import load_object_mesh
-from . import capture_scene as materials
 from . import geometry_nodes as nodes
 from . import point_caches
-from .capture_scene import BODY, FOUND, FRAMES, LAYER, LAYERS, MODIFIER, NOMINAL, POINTS, RATE, ROLE, trial_collections
+from .capture_materials import COLOURS, FOUND, GHOST_ALPHA, LAYERS, NOMINAL, plain_material
+from .capture_scene import BODY, FRAMES, LAYER, MODIFIER, POINTS, RATE, ROLE, trial_collections
 
 BEFORE, AFTER = "before", "after"
 OVERLAID_BAKES = "physgen_bake"
-OVERLAY_COLOURS = {BEFORE: materials.COLOURS[NOMINAL], AFTER: materials.COLOURS[FOUND]}
+OVERLAY_COLOURS = {BEFORE: COLOURS[NOMINAL], AFTER: COLOURS[FOUND]}
 
 
 def build_overlay(scene: bpy.types.Scene, folder: Scene, bake: Bake, which: str) -> bpy.types.Collection:
@@ -74,13 +74,13 @@ def show_overlay(before: bpy.types.Collection | None, after: bpy.types.Collectio
         ghost = which == BEFORE and choice == "BOTH"
         for item in collection.objects:
             item.data.materials[0] = _material(which, ghost=ghost)
-            item.color = (*OVERLAY_COLOURS[which], materials.GHOST_ALPHA if ghost else 1.0)
+            item.color = (*OVERLAY_COLOURS[which], GHOST_ALPHA if ghost else 1.0)
 
 
 def _material(which: str, *, ghost: bool) -> bpy.types.Material:
     if ghost:
-        return materials.plain_material(f"{which} ghost", OVERLAY_COLOURS[which], alpha=materials.GHOST_ALPHA)
-    return materials.plain_material(which, OVERLAY_COLOURS[which])
+        return plain_material(f"{which} ghost", OVERLAY_COLOURS[which], alpha=GHOST_ALPHA)
+    return plain_material(which, OVERLAY_COLOURS[which])
 
 
 def _add_object(root: bpy.types.Collection, folder: Scene, name: str, which: str) -> bpy.types.Object:

@@ -83,14 +83,8 @@ def _faces(folder: Path, item: dict[str, Any]) -> NDArray[np.int32]:
 
 
 TINT = (0.22, 0.62, 1.0)
-
-
 OPACITY = 0.72
-
-
 AMBIENT = 0.35
-
-
 LIGHT = np.array((0.35, -0.45, 0.82), dtype=np.float32)
 """Unit vector towards the light, in world axes."""
 

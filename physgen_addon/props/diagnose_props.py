@@ -20,7 +20,7 @@ from bpy.props import (
 from ...sim.app.bake_options import BakeOptions
 from ..paths import RELATIVE
 from ..playback import capture_view
-from ..playback.capture_scene import LAYERS
+from ..playback.capture_materials import LAYERS
 from ..text import readable
 from .generated_properties import from_field, switch
 

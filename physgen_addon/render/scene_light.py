@@ -23,8 +23,6 @@ from . import render_engines
 from .sky_lamps import SkyLamp, sky_lamps
 
 LAMPS_ABOVE, LAMPS_BELOW = 16, 8
-
-
 OPEN_RADIANCE = 2.0
 """EEVEE's lamps are scaled so that open white ground has this radiance: it stores a surface's colour, here 1 over the
 reference lighting, with few bits and up to 8. Only ratios of light affect the image.

@@ -15,8 +15,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 import physgen
 from mathutils import Matrix
-from physgen.physgen_addon import background_jobs, bake_state, overlays, paths
-from physgen.physgen_addon import bake_state as unsaved
+from physgen.physgen_addon import background_jobs, bake_state, overlays, paths, unsaved_bakes
 from physgen.physgen_addon.bake_state import BakeState
 from physgen.physgen_addon.operators.bake_ops import Bake
 from physgen.physgen_addon.playback import bake_record, point_caches, show_bake
@@ -238,7 +237,7 @@ def test_a_file_from_somebody_else_cannot_say_what_is_moved_and_deleted(file, tm
     victim.mkdir(parents=True)
     scene().physgen.simulation.unsaved = key.format(elsewhere=tmp_path / "elsewhere")
     assert paths.unsaved_cache(scene(), scene().physgen.simulation.unsaved) is None
-    unsaved.settle(scene())
+    unsaved_bakes.settle(scene())
     assert victim.is_dir()
 
 

@@ -12,14 +12,12 @@ from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectB
 from physgen.sim.diagnose.rigid import fit_rigid
 from physgen.sim.diagnose.rigid.observed_poses import (
     another_side_up,
-    as_matrix,
-    from_rotvec,
-    multiply,
     observe_body,
     perturbed,
     state_difference,
     turns_on_a_face,
 )
+from physgen.sim.diagnose.rigid.quaternions import as_matrix, from_rotvec, multiply
 from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
 from physgen.sim.diagnose.rigid.rigid_localisation import _directions

@@ -10,10 +10,11 @@ import pytest
 import trimesh
 from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.rigid import fit_rigid
-from physgen.sim.diagnose.rigid.observed_poses import as_matrix, fit_rotation, from_rotvec, observe_body, project
+from physgen.sim.diagnose.rigid.held_out_score import middle_frame
+from physgen.sim.diagnose.rigid.observed_poses import fit_rotation, observe_body, project
+from physgen.sim.diagnose.rigid.quaternions import as_matrix, from_rotvec
 from physgen.sim.diagnose.rigid.resting_contact import height, resting_state
 from physgen.sim.diagnose.rigid.rigid_candidates import BodyScene
-from physgen.sim.diagnose.rigid.rigid_prediction import middle_frame
 from physgen.sim.diagnose.rigid.rigid_search import body_problem
 from physgen.sim.diagnose.rigid.rigid_simulator import rigid_body
 from physgen.sim.diagnose.work import Work

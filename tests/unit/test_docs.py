@@ -148,6 +148,16 @@ def test_files_of_the_tree_exist(page):
     assert not missing
 
 
+@pytest.mark.parametrize(
+    "package",
+    [p.parent for p in sorted(ROOT.glob("[a-z]*/**/__init__.py")) if re.search(r"^\w+\.py  ", p.read_text(), re.M)],
+    ids=lambda p: p.relative_to(ROOT).as_posix(),
+)
+def test_a_package_that_lists_its_files_lists_each_and_no_other(package):
+    listed = re.findall(r"\b\w+\.py\b", (package / "__init__.py").read_text().split('"""')[1])
+    assert set(listed) == {path.name for path in package.glob("[!_]*.py")}
+
+
 def test_messages_name_pages_that_exist():
     """Docstrings, messages and comments of the tree name ``docs/…md`` and anchors that are there."""
     wrong = []

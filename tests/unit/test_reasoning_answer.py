@@ -9,17 +9,9 @@ import time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.reconstruct.reasoning.answer_entries import (
-    DENSITY,
-    LENGTH,
-    MODULUS,
-    QUANTITY_TYPES,
-    ROUGHNESS,
-    ObjectAnswer,
-    quantity,
-    yes_or_no,
-)
+from physgen.sim.reconstruct.reasoning.answer_entries import ObjectAnswer, yes_or_no
 from physgen.sim.reconstruct.reasoning.answer_parser import MAX_TEXT, MAX_UNREAD, read_answer
+from physgen.sim.reconstruct.reasoning.quantities import DENSITY, LENGTH, MODULUS, QUANTITY_TYPES, ROUGHNESS, quantity
 
 MODEL = ObjectAnswer(name="camera_model", density=200.0, stiffness="soft", size_m=0.15, fill=True)
 CAMERA = ObjectAnswer(name="camera", density=2700.0, stiffness="hard", size_m=0.2, fill=False)

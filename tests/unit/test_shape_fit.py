@@ -10,7 +10,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.shape.inflate import crop_mask
-from physgen.sim.reconstruct.shape.primitive_choice import Carver, choose_primitive, shape_of_kind
+from physgen.sim.reconstruct.shape.primitive_choice import Carver, choose_primitive
 from physgen.sim.reconstruct.shape.primitive_fit import InnerEdges, fit_box, fit_cylinder, fit_sphere
 from physgen.sim.reconstruct.shape.primitives import (
     Box,
@@ -22,6 +22,7 @@ from physgen.sim.reconstruct.shape.primitives import (
     polygons,
     rasterize,
 )
+from physgen.sim.reconstruct.shape.shape_kinds import shape_of_kind
 from physgen.sim.scene.model import Camera
 
 WIDTH, HEIGHT = 480, 360

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
-from .observed_poses import QUATERNION, ObservedBody, as_matrix, frame_pose, from_rotvec, multiply
+from .observed_poses import QUATERNION, ObservedBody, frame_pose
+from .quaternions import as_matrix, from_rotvec, multiply
 from .rigid_candidates import BodyScene
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
-from .observed_poses import as_matrix, from_rotvec, skew
+from .quaternions import as_matrix, from_rotvec, skew
 from .rigid_simulator import CONTACT_TIME, NUMBERS, SLOTS, RigidBody, set_contact, six_components
 
 Array = NDArray[np.float64]

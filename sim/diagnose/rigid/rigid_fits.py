@@ -19,6 +19,7 @@ from ..comparison_settings import SHARED
 from ..diagnosis import CandidateFit, Discrepancy, Estimate
 from ..work import Work
 from .bending import bending
+from .held_out_score import HeldOutScore, noise_floor, score_held_out
 from .multiple_shooting import Fit
 from .pair_search import BASE_GAIN, search_pairs
 from .rigid_candidates import (
@@ -32,18 +33,15 @@ from .rigid_candidates import (
 from .rigid_localisation import localise_discrepancies
 from .rigid_misfit import misfit
 from .rigid_prediction import (
-    HeldOutScore,
     Points,
     believed_fit,
     contact_spread,
     hidden_spins,
     marginal_points,
     marginal_rms,
-    noise_floor,
     pooled_rms,
     predict_points,
     prediction_spread,
-    score_held_out,
     simulate_points,
     step_size_error,
 )

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ..capture import Capture
 from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
 from .multiple_shooting import Fit
-from .observed_poses import CONTACT, QUATERNION, SPIN, TOUCHED, VELOCITY, as_matrix, project
+from .observed_poses import CONTACT, QUATERNION, SPIN, TOUCHED, VELOCITY, project
+from .quaternions import as_matrix
 from .rigid_candidates import BELIEFS, WorldSettings
 from .rigid_prediction import world_points
 from .segment_paths import Model

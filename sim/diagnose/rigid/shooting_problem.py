@@ -11,16 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .observed_poses import (
-    QUATERNION,
-    PointMoments,
-    as_rotvec,
-    conjugate,
-    from_rotvec,
-    multiply,
-    points_information,
-    state_difference,
-)
+from .observed_poses import QUATERNION, PointMoments, points_information, state_difference
+from .quaternions import as_rotvec, conjugate, from_rotvec, multiply
 from .resting_contact import height
 from .rigid_candidates import BELIEFS, BodyScene, WorldSettings
 from .rigid_simulator import RigidWorlds

@@ -12,17 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ..capture_geometry import mean_known
 from .multiple_shooting import eliminate_states
-from .observed_poses import (
-    PUSHED,
-    QUATERNION,
-    SPIN,
-    TOUCHED,
-    VELOCITY,
-    ObservedBody,
-    as_matrix,
-    frame_pose,
-    perturbed,
-)
+from .observed_poses import PUSHED, QUATERNION, SPIN, TOUCHED, VELOCITY, ObservedBody, frame_pose, perturbed
+from .quaternions import as_matrix
 from .resting_contact import height, resting_state
 from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidWorlds

@@ -3,7 +3,7 @@
 # mypy: disable-error-code="untyped-decorator, no-untyped-def, valid-type"
 # (Taichi reads the annotations itself: kernels and their functions cannot state that they return nothing or a tuple;
 # arguments without a type are as wide as what is passed.)
-"""Rigid bodies and colliders over one substep: forces, contact (``rigid_contact``, ``rigid_solve``), motion.
+"""Rigid bodies and colliders over one substep: forces, contact (``rigid_contact``, ``rigid_solver``), motion.
 
 The angular momentum is the state and the angular velocity follows from it, so that free flight keeps it exactly; the
 orientation follows the angular velocity at the middle of the substep. ``rigid_layout`` names the columns of the arrays.

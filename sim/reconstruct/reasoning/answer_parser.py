@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .answer_entries import ObjectAnswer, has_number, read_cells, read_named, read_roughness
+from .answer_entries import ObjectAnswer, read_cells, read_named, read_roughness
 from .answer_rows import MAX_LINE, MAX_LINES, LineReader, Row, Rows, read_json
+from .quantities import has_number
 
 MAX_TEXT = 2**16
 """Largest number of characters that are read; a typical answer has a few hundred."""

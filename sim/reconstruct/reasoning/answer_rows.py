@@ -8,7 +8,8 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
-from .answer_entries import ORDER, STIFFNESSES, field_of, has_number, joined_numbers, plain, with_unit_of
+from .answer_entries import ORDER, STIFFNESSES, field_of, joined_numbers, with_unit_of
+from .quantities import has_number, plain
 
 MAX_LINES = 1000
 MAX_LINE = 500

@@ -3,7 +3,8 @@
 
 object_bodies.py       a body for each object, in order; built_body.py makes one from its outline
 primitives.py          boxes, spheres, surfaces of revolution; primitive_fit.py fits one to an outline,
-                       primitive_choice.py decides which, primitive_mesh.py makes its mesh, flat_disc.py finds coins
+                       primitive_choice.py decides which, shape_kinds.py usual shapes of things,
+                       primitive_mesh.py makes its mesh, flat_disc.py finds coins
 inflate.py             thickness of a silhouette; inflated_mesh.py its mesh
 reference_surfaces.py  middle surfaces of inflated bodies, from a wall, legs or a depth map; legs.py finds legs,
                        lying.py lays rings and sticks on the ground, floor_limbs.py what lies in front of a body

@@ -19,10 +19,11 @@ from .body_texture import colour_pixels, corner_pixels
 from .furniture import furniture_boards
 from .inflate import Crop, crop_mask, inflate
 from .inflated_mesh import TOPPLES, BodyMesh, inflated_mesh
-from .primitive_choice import FURNITURE, KindShape, PrimitiveChoice, choose_primitive, shape_of_kind
+from .primitive_choice import PrimitiveChoice, choose_primitive
 from .primitive_mesh import bent_mesh, solid_mesh, warp_to_outline
 from .primitives import Box, rasterize
 from .reference_surfaces import front_of
+from .shape_kinds import FURNITURE, KindShape, shape_of_kind
 from .stability import footed, support_of
 from .surface_mesh import WORTH_SAYING
 
