@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ...sim.diagnose.capture import Camera, Capture, CaptureObject, Trial
 from ...sim.errors import InputError
+from ...sim.plane_axes import plane_axes
 from ...sim.rigid_alignment import nearest_rotation
 from ...sim.scene.model import Camera as SceneCamera
 from .. import compat
-from ..render.render_regions import plane_axes
 from ..scene_io.photo_view import add_camera
 from . import geometry_nodes as nodes
 from .capture_materials import (

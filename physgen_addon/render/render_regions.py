@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...sim.plane_axes import plane_axes
 from ...sim.scene.model import Camera, SceneModel
 from ...sim.smoothstep import smoothstep
 
@@ -142,14 +143,6 @@ def _grown(points: NDArray[np.float64], normal: NDArray[np.floating], by: float)
     low, high = flat.min(axis=0) - by, flat.max(axis=0) + by
     grid = np.stack(np.meshgrid(*np.linspace(low, high, 17).T), axis=-1).reshape(-1, 2)
     return np.asarray(grid @ axes + float(points.mean(axis=0) @ normal) * normal)
-
-
-def plane_axes(normal: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two unit vectors that span the plane with ``normal``, right-handed with it."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first)
-    return first, np.cross(normal, first)
 
 
 def _bounds(camera: Camera, points: NDArray[np.floating], size: tuple[int, int], margin: int) -> Box | None:

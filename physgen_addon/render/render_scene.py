@@ -16,6 +16,7 @@ from PIL import Image
 
 from ...sim.atomic import scratch_prefix
 from ...sim.composite.srgb import read_rgb
+from ...sim.plane_axes import plane_axes
 from ...sim.scene.folder import Scene, require_photo
 from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
 from ...sim.scene.model import Camera, Ground, SceneObject
@@ -34,7 +35,7 @@ from .object_material import (
     show_highlights,
 )
 from .render_options import RenderOptions
-from .render_regions import Box, plane_axes
+from .render_regions import Box
 from .scene_light import add_environment, add_lamps
 
 UV = "photo"

@@ -16,12 +16,12 @@ from mathutils import Matrix, Quaternion, Vector
 from numpy.typing import NDArray
 
 from ...sim.errors import InputError
+from ...sim.plane_axes import plane_axes
 from ...sim.scene.equirectangular import LUMINANCE, irradiance
 from ...sim.scene.folder import Scene
 from ...sim.scene.model import Camera, Light
 from .. import compat
 from ..paths import load_image
-from ..render.render_regions import plane_axes
 from .export_meshes import box_corners
 
 SENSOR_MM = 36.0

@@ -64,7 +64,7 @@ def inpaint(
             "use a photo with more room around the objects, or a smaller hole_dilation"
         )
     filling = pixels.copy()
-    for part in _parts(hole):
+    for part in hole_parts(hole):
         _fill_part(filling, part, hole, options, guide)
     alpha = _feather(hole, objects)[..., None]
     mixed = np.where(alpha >= 1.0, filling, pixels + alpha * (filling.astype(np.float32) - pixels))
@@ -96,7 +96,7 @@ def inpaint_once(
     return _at_scale(pixels, hole, closed, scale, options, guide)
 
 
-def _parts(hole: Mask) -> list[Mask]:
+def hole_parts(hole: Mask) -> list[Mask]:
     """Return the connected parts of ``hole``, smallest first: they are filled best and then serve as sources."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     order = np.argsort(stats[1:count, cv2.CC_STAT_AREA], kind="stable") + 1

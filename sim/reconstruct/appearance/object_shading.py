@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...plane_axes import plane_axes
 from ...scene.equirectangular import LUMINANCE, Radiance, directions
 from ...scene.model import Camera, Light
 from ..lighting.ground_lighting import sun_disc, surface_points
@@ -52,14 +53,6 @@ SLACK = 1.5
 """Depth bias in cells."""
 
 
-def orthonormal_pair(direction: Points) -> tuple[Points, Points]:
-    """Return two unit vectors (3,) perpendicular to the unit vector ``direction`` (3,) and to each other."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(helper, direction)
-    first /= np.linalg.norm(first)
-    return first, np.cross(direction, first)
-
-
 class Occluders:
     """Shadows on ``points`` (N, 3) with unit ``normals`` (N, 3) by surfaces sampled densely by ``surface`` (M, 3)."""
 
@@ -73,7 +66,7 @@ class Occluders:
     def reached(self, direction: Points) -> NDArray[np.float64]:
         """Return the share (N,) of light from the unit vector ``direction`` (3,) that reaches each point past the
         surfaces."""
-        first, second = orthonormal_pair(direction)
+        first, second = plane_axes(direction)
         axes, cell = np.stack([first, second, direction]), self._cell
         # One array a component: this is computed in more than a hundred directions.
         x, y, height = np.ascontiguousarray((self._surface @ axes.T).T)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...composite.inpaint import FillOptions
+from ...composite.inpaint import FillOptions, hole_parts
 from ...errors import InputError
 from ...scene.model import Camera
 from ..segmentation.plain_backdrop import plain_backdrop
@@ -225,7 +225,7 @@ def fill_background(
     open_hole = hole.copy()
     shade = np.zeros_like(hole)
     backdrop = _plain(pixels)
-    for part in _parts(hole):
+    for part in hole_parts(hole):
         # Leftover shadow outside of the hole is neither a source nor a reference level.
         dark = leftover_shadow(logarithms(filling), part, open_hole | barred)
         shade |= dark
@@ -263,13 +263,6 @@ def _amid(part: Mask, backdrop: NDArray[np.int32], closed: Mask) -> bool:
 def _widened(mask: Mask, radius: int) -> Mask:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
-
-
-def _parts(hole: Mask) -> list[Mask]:
-    """The connected parts of ``hole``, smallest first: small ones are inpainted best and then serve as surroundings."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    order = np.argsort(stats[1:count, cv2.CC_STAT_AREA], kind="stable") + 1
-    return [np.asarray(labels == index) for index in order]
 
 
 def _fill_part(
@@ -341,7 +334,7 @@ def _fill_surface(
 
 def _pieces(target: Mask) -> list[Mask]:
     """The connected parts of ``target``, smallest first; specks come together."""
-    parts = _parts(target)
+    parts = hole_parts(target)
     specks = [part for part in parts if part.sum() <= max(SMALL * part.size, SPECK * target.sum())]
     return parts if len(specks) < 2 else [np.logical_or.reduce(specks), *parts[len(specks) :]]
 

@@ -18,9 +18,9 @@ from skimage.morphology import h_maxima
 from skimage.segmentation import watershed
 
 from ...composite.srgb import bytes_to_linear
+from ...scene.equirectangular import LUMINANCE
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
-from ..lighting.ground_pixels import LUMINANCE
 from ..segmentation.alike_blocks import blocks_of_a_kind
 from ..segmentation.mask_geometry import grown
 from ..segmentation.round_things import circles_of_a_kind

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ...composite.srgb import bytes_to_linear
+from ...scene.equirectangular import LUMINANCE
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
 from ..shape.inflate import roundness
@@ -244,7 +245,6 @@ def _distance(places: Values, bodies: Sequence[ProxyBody]) -> Values:
     return nearest
 
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 BINS = (240, 13, 13)
 LOW, HIGH = np.array([-3.2, -0.65, -0.65]), np.array([1.6, 0.65, 0.65])
 """Range of luminance and two chromas about the smooth part, natural logarithms."""

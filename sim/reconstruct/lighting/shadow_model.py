@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...scene.equirectangular import LUMINANCE
 from .ground_lighting import smooth_terms
-from .ground_pixels import LUMINANCE, GroundPixels, GroundTexture, fit_smooth, pixel_noise, relative_colour
+from .ground_pixels import GroundPixels, GroundTexture, fit_smooth, pixel_noise, relative_colour
 from .shadow_lamps import shadow_tint
 
 Values = NDArray[np.float64]

@@ -20,6 +20,7 @@ from ..reconstruct_options import Proposal
 from .box_crop import edge_strength
 from .mask_geometry import grown, touching
 from .outline_sharpness import in_focus
+from .proposal_features import copy_of
 
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
@@ -87,7 +88,7 @@ HOLE = 0.95
 
 def plain_backdrop(pixels: Pixels) -> Mask | None:
     """Return the backdrop (h, w) of ``pixels`` (H, W, 3) on a copy of at most ``SIDE``; None where it is not plain."""
-    small = _copy(pixels)
+    small = copy_of(pixels, SIDE)
     steps = edge_strength(cielab(small, blur=0.8))
     calm = (steps < CALM).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * PASS + 1, 2 * PASS + 1))
@@ -157,7 +158,7 @@ def _holding(thing: Mask, parts: Sequence[Proposal], across: float, down: float)
 
 def _in_focus(things: Sequence[Mask], pixels: Pixels) -> list[bool]:
     """Whether each of ``things`` (h, w) is about the sharpest, on a copy of the size that ``in_focus`` is for."""
-    small = _copy(pixels, FOCUS_SIDE)
+    small = copy_of(pixels, FOCUS_SIDE)
     size = small.shape[1::-1]
     return in_focus([cv2.resize(thing.astype(np.float32), size) > 0.5 for thing in things], small)
 
@@ -176,7 +177,7 @@ def missing_parts(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     rows = np.flatnonzero(own.any(axis=1))
     if len(rows) == 0:
         return nothing
-    lab = cielab(_copy(pixels), blur=0.8)
+    lab = cielab(copy_of(pixels, SIDE), blur=0.8)
     behind = _behind(lab, backdrop)
     foot = rows[-1] - FOOT * (rows[-1] - rows[0])
     below = (np.arange(len(own)) > foot)[:, None]
@@ -214,9 +215,9 @@ def on_blank_page(pixels: Pixels, mask: Mask, box: tuple[int, int, int, int], ba
     A page without any shading shows no shadow, so all that is not blank and hangs together is the thing: white socks, a
     foot of a shadow's colour. None too where it goes on beyond the box. backdrop: (h, w), the reached page.
     """
-    page = np.median(_copy(pixels)[backdrop], axis=0)
+    page = np.median(copy_of(pixels, SIDE)[backdrop], axis=0)
     calm = cv2.erode(backdrop.astype(np.uint8), _disc(2 * SEAM)) > 0
-    if not calm.any() or (np.abs(_copy(pixels)[calm] - page).max(axis=-1) > BLANK).mean() > SHADED_SHARE:
+    if not calm.any() or (np.abs(copy_of(pixels, SIDE)[calm] - page).max(axis=-1) > BLANK).mean() > SHADED_SHARE:
         return None
     apart = np.abs(pixels - page).max(axis=-1)
     # A white collar hardly differs from the page: there colours and contours have decided.
@@ -358,9 +359,3 @@ def _behind(lab: NDArray[np.float32], backdrop: Mask) -> NDArray[np.float32]:
 def _disc(radius: float) -> NDArray[np.uint8]:
     side = 2 * round(radius) + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), dtype=np.uint8)
-
-
-def _copy(pixels: Pixels, side: int = SIDE) -> Pixels:
-    scale = min(1.0, side / max(pixels.shape[:2]))
-    size = (max(8, round(pixels.shape[1] * scale)), max(8, round(pixels.shape[0] * scale)))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
