@@ -37,8 +37,9 @@ from physgen.sim.gaussians.splat_ply import read_splats, write_splats
 from physgen.sim.gaussians.splats import Splats, from_half_axes, half_axes, joined
 from physgen.sim.gaussians.views.posed_images import View
 from physgen.sim.mpm.colliders import Surface
+from physgen.sim.mpm.geometry.inside_test import inside_lattice
 from physgen.sim.mpm.geometry.signed_distance import signed_distance
-from physgen.sim.mpm.geometry.triangles import face_normals, inside_lattice
+from physgen.sim.mpm.geometry.triangles import face_normals
 
 from .asset import Asset, Part
 from .pictures import AssetPictures, cache_name, rendered

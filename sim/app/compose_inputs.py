@@ -27,8 +27,9 @@ from ..gaussians.guidance.score_distillation import Guidance
 from ..gaussians.splats import Splats
 from ..gaussians.views.view_files import read_views
 from ..mpm.colliders import Surface
+from ..mpm.geometry.inside_test import winding_numbers
 from ..mpm.geometry.mesh_checks import check_surface
-from ..mpm.geometry.triangles import check_closed, face_normals, validated, winding_numbers
+from ..mpm.geometry.triangles import check_closed, face_normals, validated
 from ..scene.folder import Scene
 from ..scene.model import Camera, Ground, SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh, transformed

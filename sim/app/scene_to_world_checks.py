@@ -25,10 +25,11 @@ from ..memory import available_memory, require_memory
 from ..mpm.bodies import THIN_CELLS, BodyParticles
 from ..mpm.colliders import Collider, Surface, Track
 from ..mpm.cost_estimate import sampling_bytes
+from ..mpm.geometry.inside_test import bounding_faces
 from ..mpm.geometry.interior_sampling import MIN_PARTICLES
 from ..mpm.geometry.mesh_checks import check_surface, thickness_of
 from ..mpm.geometry.signed_distance import DistanceLattice, overlap, signed_distance
-from ..mpm.geometry.triangles import bounding_faces, validated
+from ..mpm.geometry.triangles import validated
 from ..mpm.solver_options import SolverOptions, centred
 from ..scene.bake_quality import Quality
 from ..scene.meshes import ObjectMesh

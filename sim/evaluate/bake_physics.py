@@ -20,7 +20,8 @@ from ..cache.bake_folder import METRICS_FILE, WORLD_SPACE, Bake
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled
 from ..files import is_file
-from ..mpm.geometry.triangles import bisected, check_closed, squared_distances, winding_numbers
+from ..mpm.geometry.inside_test import winding_numbers
+from ..mpm.geometry.triangles import bisected, check_closed, squared_distances
 from ..scene.folder import Scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import SceneModel

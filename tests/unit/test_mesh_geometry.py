@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.colliders import Surface
 from physgen.sim.mpm.geometry import mesh_checks
+from physgen.sim.mpm.geometry.inside_test import bounding_faces
 from physgen.sim.mpm.geometry.mass_properties import MassProperties, mass_properties
 from physgen.sim.mpm.geometry.mesh_checks import check_surface, thickness_of, thin_share
-from physgen.sim.mpm.geometry.triangles import bounding_faces, validated
+from physgen.sim.mpm.geometry.triangles import validated
 from physgen.sim.mpm.rigid.collision_shapes import surface_points
 from scipy.spatial import cKDTree
 

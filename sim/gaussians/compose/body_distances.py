@@ -22,8 +22,9 @@ from scipy.spatial import cKDTree
 
 from ...errors import InputError
 from ...mpm.colliders import Surface
+from ...mpm.geometry.inside_test import inside_lattice
 from ...mpm.geometry.signed_distance import DistanceLattice, signed_distance
-from ...mpm.geometry.triangles import check_closed, face_normals, inside_lattice, signed_volume, validated
+from ...mpm.geometry.triangles import check_closed, face_normals, signed_volume, validated
 
 Array = NDArray[np.float64]
 

@@ -12,15 +12,8 @@ from scipy.spatial import cKDTree
 
 from ...errors import InputError
 from ...mpm.colliders import Surface
-from ...mpm.geometry.triangles import (
-    bisected,
-    check_closed,
-    inside_lattice,
-    signed_volume,
-    squared_distances,
-    validated,
-    winding_numbers,
-)
+from ...mpm.geometry.inside_test import inside_lattice, winding_numbers
+from ...mpm.geometry.triangles import bisected, check_closed, signed_volume, squared_distances, validated
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...errors import InputError
-from .triangles import Array, Faces, check_closed, inside_lattice, signed_volume, validated
+from .inside_test import inside_lattice
+from .triangles import Array, Faces, check_closed, signed_volume, validated
 
 MIN_PARTICLES = 8
 """Minimum number of particles of a body: one grid cell of them at the usual density."""

@@ -14,18 +14,8 @@ from scipy.spatial import cKDTree
 
 from ...errors import InputError
 from ..colliders import Surface
-from .triangles import (
-    Array,
-    Faces,
-    batches,
-    bisected,
-    bounding_box,
-    bounding_faces,
-    check_closed,
-    face_normals,
-    ranges,
-    validated,
-)
+from .inside_test import bounding_faces
+from .triangles import Array, Faces, batches, bisected, bounding_box, check_closed, face_normals, ranges, validated
 
 MAX_PAIRS = 200_000
 """Number of face pairs that are tested for intersection."""

@@ -16,18 +16,8 @@ from scipy.ndimage import distance_transform_edt
 
 from ...errors import InputError
 from ..colliders import Surface
-from .triangles import (
-    Array,
-    Faces,
-    bisected,
-    bounding_box,
-    check_closed,
-    checked_places,
-    inside_lattice,
-    sides,
-    squared_distances,
-    validated,
-)
+from .inside_test import inside_lattice, sides
+from .triangles import Array, Faces, bisected, bounding_box, check_closed, checked_places, squared_distances, validated
 
 MAX_LATTICE_POINTS = 40_000_000
 """Maximum number of lattice points: 160 MB of distances, about 1.5 GB while they are computed."""

@@ -21,8 +21,9 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from ...errors import InputError
 from ...weak_cache import WeakCache
 from ..colliders import Surface
+from ..geometry.inside_test import bounding_faces
 from ..geometry.signed_distance import DistanceLattice, signed_distance
-from ..geometry.triangles import Array, Faces, bisected, bounding_box, bounding_faces, face_normals, validated
+from ..geometry.triangles import Array, Faces, bisected, bounding_box, face_normals, validated
 from .rigid_layout import POINT
 
 THIN_OUT = 0.35
