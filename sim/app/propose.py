@@ -42,6 +42,13 @@ class ProposalRecord:
     proposals: tuple[Proposal, ...]
 
 
+def _write(out: Path, record: ProposalRecord, picture: bytes) -> None:
+    """Write the list and its ``picture``, a JPEG file, into ``out``: those of one photo, not of two."""
+    with lock_beside(out):
+        write_bytes(out / PICTURE_FILE, picture)
+        write_json(out / LIST_FILE, to_json(record))
+
+
 def propose(
     photo: str | Path,
     *,
@@ -99,8 +106,8 @@ def propose(
     steps.finish()
     if out is not None:
         boxes = [tuple(v * picture.scale for v in item.box) for item in found]
-        shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
         file = io.BytesIO()
+        shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
         Image.fromarray(shown).save(file, format="JPEG", quality=90)
         width, height = picture.original_size
         record = ProposalRecord(
@@ -111,10 +118,7 @@ def propose(
             height=height,
             proposals=found,
         )
-        # The picture and the list of one photo, not of two.
-        with lock_beside(Path(out)):
-            write_bytes(Path(out) / PICTURE_FILE, file.getvalue())
-            write_json(Path(out) / LIST_FILE, to_json(record))
+        _write(Path(out), record, file.getvalue())
     return found
 
 
