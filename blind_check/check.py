@@ -23,7 +23,7 @@ from ..sim.diagnose.diagnosis import UNKNOWN
 from ..sim.effects.registry import effect
 from ..sim.errors import Cancelled, InputError, PhysGenError, SimulationError
 from ..sim.events import IsCancelled, OnEvent, StageProgress
-from . import rigid_causes, soft_cases
+from . import rigid_causes, soft_causes
 from .case import BlindCase, Seal, break_seal, keep_memory_private, publish, seal
 from .mujoco_world import load_mujoco
 from .rigid_cases import rigid_case
@@ -66,7 +66,7 @@ def plan_cases(count: int, rng: np.random.Generator, *, two_share: float = TWO_S
     cases = [_case("soft" if i < soft_none else "rigid") for i in range(none)]
     cases += [_case("soft" if i < soft_unknown else "rigid", UNKNOWN) for i in range(unknown)]
     cases += [_case("rigid", *_pair(rng)) for _ in range(two)]
-    cases += [_case("soft", e) for e in _round(list(soft_cases.KNOWN_CAUSES), soft_single, rng)]
+    cases += [_case("soft", e) for e in _round(list(soft_causes.KNOWN_CAUSES), soft_single, rng)]
     cases += [_case("rigid", e) for e in _round(list(rigid_causes.KNOWN_CAUSES), single - soft_single, rng)]
     return tuple(cases[i] for i in rng.permutation(count))
 

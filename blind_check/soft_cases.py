@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Causes that act on soft bodies, and the generated cases that show them."""
+"""Generated cases of soft bodies: a body, its motion under a cause, and what a camera would have seen of it."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,152 +28,7 @@ from .finite_elements import (
     tetrahedral_box,
     tetrahedral_sphere,
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SoftCause:
-    """A cause; effect, mechanism, low and high as in ``rigid_causes.Cause``. change: the world with that strength.
-
-    weaker: whether a smaller strength is the larger effect (a yield stress). active: ``strained``, ``losing`` or
-    ``always``. where: (M,) the elements it acts on, None for all or for those that flowed.
-    """
-
-    effect: str
-    mechanism: str
-    low: float
-    high: float
-    change: Callable[[float, SoftWorld], SoftWorld]
-    parameters: Callable[[float], Mapping[str, Any]]
-    weaker: bool = False
-    active: str = "strained"
-    where: NDArray[np.bool_] | None = None
-
-
-def stiffness(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """Another Young's modulus; strength: log of the factor."""
-    sign, young = float(rng.choice([-1, 1])), world.youngs_modulus
-    return SoftCause(
-        effect="stiffness",
-        mechanism="stiffness",
-        low=0.1,
-        high=1.1,
-        change=lambda s, w: dataclasses.replace(w, youngs_modulus=young * float(np.exp(sign * s))),
-        parameters=lambda s: {"E": young * float(np.exp(sign * s))},
-    )
-
-
-def internal_damping(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """Kelvin-Voigt viscosity; strength: its time in s."""
-    return SoftCause(
-        effect="internal_damping",
-        mechanism="internal_damping",
-        low=2e-5,
-        high=5e-4,
-        change=lambda s, w: dataclasses.replace(w, viscosity_s=s),
-        parameters=lambda s: {"tau": s},
-        active="losing",
-    )
-
-
-def plastic_yield(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """Von Mises plasticity; strength: yield stress over Young's modulus."""
-    young = world.youngs_modulus
-    return SoftCause(
-        effect="plastic_yield",
-        mechanism="plastic_yield",
-        low=0.1,
-        high=1.0,
-        change=lambda s, w: dataclasses.replace(w, yield_stress=s * young),
-        parameters=lambda s: {"yield_s": s * young},
-        weaker=True,
-    )
-
-
-def anisotropy(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """Fibres along one rest axis; strength: their modulus over Young's."""
-    axis, young = np.eye(3)[int(rng.integers(3))], world.youngs_modulus
-    return SoftCause(
-        effect="anisotropy",
-        mechanism="anisotropy",
-        low=0.15,
-        high=2.5,
-        change=lambda s, w: dataclasses.replace(w, fibre=(s * young, axis)),
-        parameters=lambda s: {"fibre": s * young, "axis": axis.tolist()},
-    )
-
-
-def stiffness_gradient(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """Stiffness that rises along one rest axis, E (1 + slope x); strength: slope, x from -1 to 1."""
-    axis, sign = int(np.argmax(np.ptp(solid.nodes, axis=0))), float(rng.choice([-1, 1]))
-    direction = sign * np.eye(3)[axis]
-    return SoftCause(
-        effect="stiffness_gradient",
-        mechanism="stiffness_gradient",
-        low=0.2,
-        high=0.9,
-        change=lambda s, w: dataclasses.replace(w, gradient=s * direction),
-        parameters=lambda s: {"slope": s, "direction": direction.tolist()},
-        where=np.abs(relative(solid)[:, axis]) > 0.5,
-    )
-
-
-def relative(solid: Solid) -> Array:
-    """Return element centres over the half extents: (M, 3) in [-1, 1]."""
-    return np.asarray(solid.centres / (np.ptp(solid.nodes, axis=0) / 2))
-
-
-def periodic(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """A horizontal oscillating force; strength: m/s²."""
-    azimuth, rate = rng.uniform(-np.pi, np.pi), float(rng.uniform(10, 25))
-    direction = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    return SoftCause(
-        effect="unknown",
-        mechanism="periodic",
-        low=0.3,
-        high=8.0,
-        change=lambda s, w: dataclasses.replace(w, force=lambda t: s * np.sin(rate * t) * direction),
-        parameters=lambda s: {"amplitude": (s * direction).tolist(), "omega": rate},
-        active="always",
-    )
-
-
-def growth(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """A body that swells; strength: 1/s."""
-    sign = float(rng.choice([-1, 1]))
-    return SoftCause(
-        effect="unknown",
-        mechanism="growth",
-        low=0.02,
-        high=0.35,
-        change=lambda s, w: dataclasses.replace(w, growth=sign * s),
-        parameters=lambda s: {"rate": sign * s},
-        active="always",
-    )
-
-
-def fading(solid: Solid, world: SoftWorld, rng: np.random.Generator) -> SoftCause:
-    """A body that softens over time; strength: 1/s."""
-    return SoftCause(
-        effect="unknown",
-        mechanism="fading",
-        low=0.2,
-        high=1.3,
-        change=lambda s, w: dataclasses.replace(w, fading=s),
-        parameters=lambda s: {"rate": s},
-    )
-
-
-Maker = Callable[[Solid, SoftWorld, np.random.Generator], SoftCause]
-
-KNOWN_CAUSES: Mapping[str, Maker] = {
-    "stiffness": stiffness,
-    "internal_damping": internal_damping,
-    "plastic_yield": plastic_yield,
-    "anisotropy": anisotropy,
-    "stiffness_gradient": stiffness_gradient,
-}
-UNKNOWN_CAUSES: Mapping[str, Maker] = {"periodic": periodic, "growth": growth, "fading": fading}
-
+from .soft_causes import KNOWN_CAUSES, UNKNOWN_CAUSES, SoftCause
 
 LEAST_OVER_NOISE, MOST_OVER_NOISE = 6.0, 80.0
 MEDIUM_FROM_PA = 1e5
@@ -323,7 +177,6 @@ def _assembled(
     ratio: float,
     rng: np.random.Generator,
 ) -> BlindCase:
-    vertices, faces = surface_mesh(shape.fine)
     corners, weights = _marks(shape.fine, int(rng.integers(18, 46)), rng)
     rest = (shape.fine.nodes[corners] * weights[..., None]).sum(axis=1)
     frames, withheld, share = len(times), 2, float(rng.uniform(0.03, 0.1))
@@ -333,21 +186,7 @@ def _assembled(
         name = f"take{index + 1:02d}"
         clean, plain = ((m.nodes[index][:, corners] * weights[None, :, :, None]).sum(axis=2) for m in (motion, nominal))
         shown = frames if index < len(starts) - withheld else round(float(rng.uniform(0.13, 0.2)) / interval)
-        begins = round(float(rng.uniform(0, 0.4)), 3)
-        observed = clean + rng.normal(scale=noise, size=clean.shape)
-        observed[np.asarray(drop_points(frames, len(rest), share, rng), dtype=bool)] = np.nan
-        trials.append(
-            Trial(
-                name=name,
-                role="fit" if shown == frames else "predict",
-                times=begins + times[:shown],
-                points=observed[:shown].astype(np.float32).astype(np.float64),
-                pixels=None,
-                object_index=np.zeros(len(rest), dtype=np.int64),
-                rest_points=rest,
-                predict_times=None if shown == frames else begins + times[shown:],
-            )
-        )
+        trials.append(_take(name, clean, rest, times, shown, share, noise, rng))
         active = _active(cause, motion, index)
         truths[name] = TrialTruth(
             points=clean[:shown],
@@ -360,22 +199,7 @@ def _assembled(
         notes[name] = {"style": start.style, "effect_rms_m": float(np.sqrt(gap.mean()))}
         if shown < frames:
             gaps.append(gap[shown:].mean())
-    belief = ObjectBelief(
-        name="body",
-        mesh="body.obj",
-        density_kg_m3=round(world.density, 3),
-        stiffness="medium" if world.youngs_modulus >= MEDIUM_FROM_PA else "soft",
-        youngs_modulus_pa=round(world.youngs_modulus, 3),
-        poisson_ratio=round(world.poisson_ratio, 6),
-    )
-    capture = Capture(
-        gravity=(0.0, 0.0, -9.81),
-        ground=Ground(friction=round(world.friction, 6), restitution=None),
-        objects=(CaptureObject(belief=belief, vertices=vertices, faces=faces),),
-        noise_sigma=noise,
-        camera=None,
-        trials=tuple(trials),
-    )
+    capture = _capture(shape, world, noise, trials)
     extra: Mapping[str, Any] = {
         "shape": shape.name,
         "observation": "points",
@@ -403,6 +227,50 @@ def _assembled(
         notes=extra,
     )
     return BlindCase(capture=capture, truth=truth)
+
+
+def _take(
+    name: str, clean: Array, rest: Array, times: Array, shown: int, share: float, noise: float, rng: np.random.Generator
+) -> Trial:
+    """The trial of points at ``clean`` (F, K, 3), with noise and a ``share`` of them lost.
+
+    rest: (K, 3) the points at rest. times: (F,) of which the first ``shown`` are recorded, the others to be predicted.
+    """
+    frames = len(times)
+    begins = round(float(rng.uniform(0, 0.4)), 3)
+    observed = clean + rng.normal(scale=noise, size=clean.shape)
+    observed[np.asarray(drop_points(frames, len(rest), share, rng), dtype=bool)] = np.nan
+    return Trial(
+        name=name,
+        role="fit" if shown == frames else "predict",
+        times=begins + times[:shown],
+        points=observed[:shown].astype(np.float32).astype(np.float64),
+        pixels=None,
+        object_index=np.zeros(len(rest), dtype=np.int64),
+        rest_points=rest,
+        predict_times=None if shown == frames else begins + times[shown:],
+    )
+
+
+def _capture(shape: _Shape, world: SoftWorld, noise: float, trials: Sequence[Trial]) -> Capture:
+    """The capture of ``trials``, with what is believed of the body."""
+    vertices, faces = surface_mesh(shape.fine)
+    belief = ObjectBelief(
+        name="body",
+        mesh="body.obj",
+        density_kg_m3=round(world.density, 3),
+        stiffness="medium" if world.youngs_modulus >= MEDIUM_FROM_PA else "soft",
+        youngs_modulus_pa=round(world.youngs_modulus, 3),
+        poisson_ratio=round(world.poisson_ratio, 6),
+    )
+    return Capture(
+        gravity=(0.0, 0.0, -9.81),
+        ground=Ground(friction=round(world.friction, 6), restitution=None),
+        objects=(CaptureObject(belief=belief, vertices=vertices, faces=faces),),
+        noise_sigma=noise,
+        camera=None,
+        trials=tuple(trials),
+    )
 
 
 def _marks(solid: Solid, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], Array]:

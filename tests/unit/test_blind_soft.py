@@ -13,7 +13,7 @@ from physgen.blind_check.finite_elements import (
     tetrahedral_box,
     tetrahedral_sphere,
 )
-from physgen.blind_check.soft_cases import KNOWN_CAUSES
+from physgen.blind_check.soft_causes import KNOWN_CAUSES
 
 WORLD = SoftWorld(density=500.0, youngs_modulus=8e4, poisson_ratio=0.3, friction=0.4)
 
