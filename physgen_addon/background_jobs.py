@@ -368,14 +368,17 @@ def start_chosen(
 
 
 def progress_text(job: Job) -> str:
-    """Return progress as text, such as ``Diagnose: fits 40 %, 12 s left``; elapsed time if the fraction is unknown."""
+    """Return progress as text, such as ``Diagnose: fits 40 %, 12 s left``; elapsed time if what is left is unknown, so
+    that a long step is seen to go on.
+    """
     # "Reconstruction: reconstruct" says nothing that "Reconstruction" does not.
     is_told = not job.stage or job.stage.lower()[:5] == job.title.lower()[:5]
     text = job.title if is_told else f"{job.title}: {job.stage}"
-    if job.fraction is None:
-        return f"{text}, {time.monotonic() - job.started:.0f} s"
-    text += f" {100 * job.fraction:.0f} %"
-    return text if job.eta_s is None else f"{text}, {duration(job.eta_s)} left"
+    if job.fraction is not None:
+        text += f" {100 * job.fraction:.0f} %"
+        if job.eta_s is not None:
+            return f"{text}, {duration(job.eta_s)} left"
+    return f"{text}, {duration(time.monotonic() - job.started)}"
 
 
 def unregister_jobs() -> None:

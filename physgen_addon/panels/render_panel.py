@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import bpy
+import gpu
 
 from .. import blend_trust, text
 from ..background_jobs import running
@@ -11,6 +12,19 @@ from ..operators.export_ops import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_
 from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command, written
 from ..operators.render_ops import PHYSGEN_OT_look_nodes, PHYSGEN_OT_render_still, PHYSGEN_OT_render_video
 from .sidebar import RENDER, Sidebar, draw_job, draw_result, optional
+
+SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader", "basic render")
+"""Parts of the names of renderers that draw without a graphics card."""
+
+
+def draws_in_software(renderer: str) -> bool:
+    """Return whether ``renderer``, as OpenGL or Vulkan calls it, has no graphics card."""
+    return any(name in renderer.lower() for name in SOFTWARE)
+
+
+def _graphics() -> str:
+    # There is none without a window.
+    return "" if bpy.app.background else gpu.platform.renderer_get()
 
 
 class PHYSGEN_PT_render(Sidebar, bpy.types.Panel):
@@ -40,6 +54,8 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     choices.prop(rendering, "engine")
     if rendering.engine == "cycles":
         choices.prop(rendering, "device")
+    elif draws_in_software(_graphics()):
+        text.sentences(choices, context, "There is no graphics card: EEVEE is slow, Cycles is faster.", icon="ERROR")
     optional(choices, rendering, "own_samples", "samples", "Samples", otherwise="Automatic")
     choices.prop(rendering, "size", slider=True)
     choices.prop(rendering, "format")

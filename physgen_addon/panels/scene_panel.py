@@ -15,7 +15,7 @@ from ..operators.body_ops import PHYSGEN_OT_add_bodies
 from ..operators.import_ops import PHYSGEN_OT_choose_splats, PHYSGEN_OT_import_scene
 from ..operators.photo_object_ops import PHYSGEN_OT_show_cutouts
 from ..operators.photo_ops import PHYSGEN_OT_open_photo, PHYSGEN_OT_use_image, image_here
-from ..operators.render_ops import PHYSGEN_OT_render_video
+from ..operators.render_ops import PHYSGEN_OT_render_still, PHYSGEN_OT_render_video
 from ..props.body_props import bodies
 from . import photo_panel
 from .photo_panel import draw_photo
@@ -97,6 +97,7 @@ def _draw_baked(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row.operator("screen.animation_play", text="Stop" if plays else "Play", icon="PAUSE" if plays else "PLAY")
     if context.scene.physgen.folder:
         row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
+        row.operator(PHYSGEN_OT_render_still.bl_idname, text="", icon="RENDER_STILL")
         draw_result(layout, context.scene.physgen.rendering)
 
 

@@ -219,6 +219,11 @@ def test_a_job_reports_progress_and_is_cancelled():
     assert background_jobs.progress_text(job) == "Fitting: fits 25 %, 9 s left"
     job.title, job.stage = "Reconstruction", "reconstruct"
     assert background_jobs.progress_text(job) == "Reconstruction 25 %, 9 s left"
+    # A long first step is seen to go on.
+    job.eta_s, job.started = None, time.monotonic() - 35.0
+    assert background_jobs.progress_text(job) == "Reconstruction 25 %, 35 s"
+    job.fraction = None
+    assert background_jobs.progress_text(job) == "Reconstruction, 35 s"
     job.cancel()
     with pytest.raises(Cancelled):
         job.wait()

@@ -13,6 +13,7 @@ from physgen.batch.commands.render_commands import render_options
 from physgen.batch.render import build_parser
 from physgen.physgen_addon import interpreter, paths
 from physgen.physgen_addon.operators import render_ops
+from physgen.physgen_addon.panels.render_panel import draws_in_software
 from physgen.physgen_addon.panels.sidebar import RESULTS
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS, effect_values
 from physgen.physgen_addon.render.render_options import RenderOptions
@@ -238,3 +239,18 @@ def test_another_format_goes_to_a_folder_of_its_own(tmp_path):
     assert render_ops._output_folder(bpy.context.scene) == tmp_path / "frames"
     rendering.format = "exr_layers"
     assert render_ops._output_folder(bpy.context.scene) == tmp_path / "frames_exr"
+
+
+@pytest.mark.parametrize(
+    ("renderer", "is_software"),
+    [
+        ("llvmpipe (LLVM 19.1.7, 256 bits)", True),
+        ("Microsoft Basic Render Driver", True),
+        ("NVIDIA GeForce RTX 4070/PCIe/SSE2", False),
+        ("Apple M2", False),
+        ("", False),
+    ],
+)
+def test_a_machine_without_a_graphics_card_is_told(renderer, is_software):
+    """A frame by EEVEE then takes minutes."""
+    assert draws_in_software(renderer) == is_software

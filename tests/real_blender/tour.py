@@ -92,6 +92,20 @@ def by_panel():
     yield from screens.shoot(SCREENS, "07_stale")
 
 
+def unbaked():
+    """Played before a bake: status bar and panel say why nothing moves, until it stops."""
+    yield from home()
+    with screens.focus():
+        bpy.ops.physgen.add_bodies()
+    told = session.extension("physgen_addon.handlers")._told
+    yield from screens.point(*screens.middle())
+    yield from screens.press("space")
+    yield from session.until(lambda: told[0], 30, "the status bar")
+    yield from screens.shoot(SCREENS, "06_unbaked")
+    yield from screens.press("Escape")
+    yield from session.until(lambda: not told[0], 30, "the status bar to be free again")
+
+
 def refused():
     """What cannot be baked, and a worker that cannot simulate: the popup and the panel."""
     yield from home()
@@ -348,6 +362,6 @@ def wanted(step) -> bool:
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
-STEPS = [arranged, first_bake, by_panel, refused, menus, sample_meshes, sample_photo, farm, nodes]
+STEPS = [arranged, first_bake, by_panel, unbaked, refused, menus, sample_meshes, sample_photo, farm, nodes]
 STEPS += [dropped, material, strange]
 session.run("tour", [step for step in STEPS if wanted(step)])
