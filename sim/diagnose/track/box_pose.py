@@ -193,6 +193,22 @@ def _prior(picture: tuple[int, int]) -> tuple[Array, Array]:
     return expected, np.array([1 / FOCAL_SPREAD, 0.0, 1 / ROLL_SPREAD, 0.0])
 
 
+def _damped_step(
+    a: Array, b: Array, d: Array, g: Array, h: Array, damping: float, *, fixed: bool
+) -> tuple[Array, Array]:
+    """Steps of camera (4,), 0 if ``fixed``, and states (T, 4) from the normal equations: a (4, 4) of the camera, b
+    (T, 4, 4) that couples it to the states, d (T, 4, 4) of those; right sides g (4,) and h (T, 4)."""
+    lifted = d + damping * np.einsum("tii->ti", d)[:, :, None] * np.eye(4) + 1e-9 * np.eye(4)
+    inverse = np.linalg.inv(lifted)
+    if fixed:
+        step = np.zeros(4)
+    else:
+        left = a + damping * np.diag(np.diag(a)) - np.einsum("tik,tkl,tjl->ij", b, inverse, b)
+        step = np.linalg.lstsq(left, g - np.einsum("tik,tkl,tl->i", b, inverse, h), rcond=None)[0]
+        step = np.clip(step, -0.3, 0.3)
+    return step, np.einsum("tkl,tl->tk", inverse, h - np.einsum("tik,i->tk", b, step))
+
+
 def _refine(
     support: Array,
     camera: Array,
@@ -242,15 +258,7 @@ def _refine(
         now = cost(camera, states, off, width)
         better = False
         while damping < 1e8:
-            lifted = d + damping * np.einsum("tii->ti", d)[:, :, None] * np.eye(4) + 1e-9 * np.eye(4)
-            inverse = np.linalg.inv(lifted)
-            if fixed:
-                step = np.zeros(4)
-            else:
-                left = a + damping * np.diag(np.diag(a)) - np.einsum("tik,tkl,tjl->ij", b, inverse, b)
-                step = np.linalg.lstsq(left, g - np.einsum("tik,tkl,tl->i", b, inverse, h), rcond=None)[0]
-                step = np.clip(step, -0.3, 0.3)
-            own = np.einsum("tkl,tl->tk", inverse, h - np.einsum("tik,i->tk", b, step))
+            step, own = _damped_step(a, b, d, g, h, damping, fixed=fixed)
             tried = camera + step, states + own
             new = residuals(*tried)
             if 0.05 < tried[0][1] < 1.6 and cost(*tried, new, width) < now:

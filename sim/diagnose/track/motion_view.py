@@ -245,6 +245,42 @@ def _frame(down: Array) -> Array:
     return np.stack([across, np.zeros(2), -down], axis=1)
 
 
+def _flight_scale(by_size: float, by_flight: float, diameter_px: float) -> tuple[float, str]:
+    """The scale in px/m from the body's size and from gravity, both if they agree, and a note on it."""
+    spread = float(np.hypot(0.02, SIZE_PX / diameter_px))
+    if abs(np.log(by_flight / by_size)) < 2 * np.hypot(spread, FLIGHT_SPREAD):
+        # Size and flight both measure the scale; apart from each other they speak of a wrong clock, which stays a gap.
+        part = spread**2 / (spread**2 + FLIGHT_SPREAD**2)
+        scale = float(np.exp((1 - part) * np.log(by_size) + part * np.log(by_flight)))
+        return scale, f"scale {scale:.0f} px/m from the size and the flight"
+    note = f"scale {by_size:.0f} px/m from the size; the flight would give {by_flight:.0f}: is the clock off?"
+    return by_size, note
+
+
+def _free_span(
+    main: Piece, pieces: list[Piece], flights: list[Piece], impacts: list[int], down: Array, count: int
+) -> tuple[int, int]:
+    """The first and the last of ``count`` frames in which the body moves freely around its longest flight ``main``."""
+    first, last = main.first, main.last
+    ordered = sorted(pieces, key=lambda p: p.first)
+    at = ordered.index(main)
+    for piece in reversed(ordered[:at]):
+        if piece not in flights or not _bounce(piece, ordered[ordered.index(piece) + 1], down):
+            break
+        first = piece.first
+    speed = float(np.linalg.norm(main.end))
+    previous = main
+    for piece in ordered[at + 1 :]:
+        settled = np.linalg.norm(piece.begin) < 0.25 * speed
+        if not (_bounce(previous, piece, down) and (piece in flights or settled)):
+            break
+        last, previous = piece.last, piece
+    tail = [k for k in impacts if k > last]
+    if tail and last == previous.last and count - 1 - last < 3 * LEAST_PIECE:
+        last = tail[0] - 1
+    return first, last
+
+
 def _flight(
     times: Array,
     places: Array,
@@ -265,32 +301,9 @@ def _flight(
     weights = np.array([float(p.last - p.first) ** 2 for p in flights]) / np.maximum(speeds, 1e-9)
     pull = float(np.average(strengths, weights=weights))
     notes = [f"a flight: things fall with {pull / scale:.3g} m/s² by the body's size"]
-    by_flight, spread = pull / GRAVITY, float(np.hypot(0.02, SIZE_PX / diameter_px))
-    if abs(np.log(by_flight / scale)) < 2 * np.hypot(spread, FLIGHT_SPREAD):
-        # Size and flight both measure the scale; apart from each other they speak of a wrong clock, which stays a gap.
-        part = spread**2 / (spread**2 + FLIGHT_SPREAD**2)
-        scale = float(np.exp((1 - part) * np.log(scale) + part * np.log(by_flight)))
-        notes.append(f"scale {scale:.0f} px/m from the size and the flight")
-    else:
-        notes.append(f"scale {scale:.0f} px/m from the size; the flight would give {by_flight:.0f}: is the clock off?")
-    first, last = main.first, main.last
-    ordered = sorted(pieces, key=lambda p: p.first)
-    at = ordered.index(main)
-    for piece in reversed(ordered[:at]):
-        if piece not in flights or not _bounce(piece, ordered[ordered.index(piece) + 1], down):
-            break
-        first = piece.first
-    speed = float(np.linalg.norm(main.end))
-    previous = main
-    bounces: list[int] = []
-    for piece in ordered[at + 1 :]:
-        settled = np.linalg.norm(piece.begin) < 0.25 * speed
-        if not (_bounce(previous, piece, down) and (piece in flights or settled)):
-            break
-        last, previous = piece.last, piece
-    tail = [k for k in impacts if k > last]
-    if tail and last == previous.last and len(times) - 1 - last < 3 * LEAST_PIECE:
-        last = tail[0] - 1
+    scale, note = _flight_scale(scale, pull / GRAVITY, diameter_px)
+    notes.append(note)
+    first, last = _free_span(main, pieces, flights, impacts, down, len(times))
     matrix = _frame(down) * scale
     origin = places[first]
     world = (places - origin) @ matrix / scale**2
