@@ -21,8 +21,8 @@ bake_resume.py         checkpoints, and repair of a damaged bake
 bake_transfer.py       a bake of Blender's scene for the photo's
 pack_bake.py           bakes that travel
 simulation.py          the running world of a bake
-scene_to_world.py      scene → engine's world: scene_bodies.py bodies, scene_contacts.py contacts,
-                       scene_to_world_checks.py checks, matter_maps.py painted stiffness
+scene_to_world.py      scene → engine's world: scene_bodies.py bodies, scene_to_world_checks.py checks,
+                       matter_maps.py painted stiffness
 preview_server.py      the live preview's worker; preview_simulation.py its coarse runs
 diagnose.py            capture → diagnosis; explain.py video → diagnosis
 import_capture.py      recordings of other programs → capture

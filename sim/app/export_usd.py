@@ -25,6 +25,7 @@ from ..errors import InputError
 from ..events import IsCancelled, never
 from ..files import is_file, shown
 from ..memory import ran_out
+from ..mpm.scene_contacts import surface
 from ..mpm.surface_contact import SurfaceContact
 from ..scene.folder import SCENE_FILE, Scene, unchanged_scene
 from ..scene.scene_object import SceneObject
@@ -32,7 +33,6 @@ from ..scene.shading import evenly_lit_mesh
 from ..scene.textured_mesh import TexturedMesh
 from .export_patch import prim_name
 from .scene_bodies import Mass, mass_of
-from .scene_contacts import surface
 from .usd_motion import UsdMotion, UsdObject, extent, quaternion, vectors
 from .usd_particles import is_whole, prepared_particles, write_particles, write_scene
 

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..memory import ENGINE_RESERVED, available_memory
 from ..mpm.cost_estimate import Estimate, estimate, longest_step, refuse_excess, stable_step
 from ..mpm.implicit_choice import may_pay, why_explicit
+from ..mpm.scene_contacts import contact_table
 from ..mpm.solver_options import SolverOptions
 from ..mpm.world_setup import WorldSetup
 from ..scene.bake_quality import Quality, load_quality
@@ -26,7 +27,6 @@ from ..scene.units import Similarity
 from ..weak_cache import WeakCache
 from .bake_options import BakeOptions
 from .scene_bodies import body_of, colliders_of, granular_names, jump_notices, surface_of, track_of
-from .scene_contacts import contact_table
 from .scene_to_world_checks import require_above_ground, resolve, separate, surface_warnings
 
 _WARNINGS: WeakCache[ObjectMesh, list[str]] = WeakCache()

@@ -13,7 +13,7 @@ from physgen.sim.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 MAY_IMPORT_TAICHI = ("sim/mpm", "sim/constitutive", "sim/gaussians", "sim/diagnose/rigid", "sim/diagnose/soft")
-INTERFACE = ("operators", "panels", "preview", "background_jobs", "handlers", "gizmos", "bake_state")
+INTERFACE = ("operators", "panels", "preview", "background_jobs", "handlers", "gizmos", "bake_state", "unsaved_bakes")
 UPWARD = {
     "props": INTERFACE,
     "frames": INTERFACE,
@@ -57,6 +57,11 @@ def test_sim_needs_no_blender_and_never_looks_upward(path):
     assert not [n for n in names if n.split(".")[0] in ("bpy", "mathutils", "bmesh", "physgen_addon", "batch")]
     if not str(path.relative_to(ROOT).as_posix()).startswith(MAY_IMPORT_TAICHI):
         assert not [n for n in names if n.split(".")[0] == "taichi"]
+
+
+def test_nothing_below_the_use_cases_imports_them():
+    below = [path for path in sources("sim") if "app" not in path.relative_to(ROOT).parts]
+    assert not [path for path in below if any(name.startswith("sim.app") for name in imports(path))]
 
 
 @pytest.mark.parametrize("path", sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))

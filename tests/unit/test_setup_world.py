@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from physgen.sim.app.bake_estimate import estimate_bake
 from physgen.sim.app.bake_options import BakeOptions, inputs_hash
-from physgen.sim.app.scene_contacts import contact_table
 from physgen.sim.app.scene_to_world_checks import BOX_BODIES, cell_size, vertices_at
 from physgen.sim.constitutive import RigidMaterial
 from physgen.sim.errors import InputError
 from physgen.sim.mpm.geometry.signed_distance import overlap, signed_distance
+from physgen.sim.mpm.scene_contacts import contact_table
 from physgen.sim.scene.bake_quality import load_quality, quality_names
 from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.material import load_preset

@@ -15,7 +15,6 @@ import trimesh
 from physgen.batch.farm.planning.job_file import load_job
 from physgen.sim import atomic
 from physgen.sim.app.scene_bodies import colliders_of
-from physgen.sim.app.scene_contacts import contact_table
 from physgen.sim.cache.bake_folder import BakedObject, free_bake, save_manifest
 from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.diagnose.capture import load_capture
@@ -23,6 +22,7 @@ from physgen.sim.errors import InputError
 from physgen.sim.importers.coco_masks import masks_from_json
 from physgen.sim.importers.recordings import read_recording
 from physgen.sim.importers.rigid_models import read_rigid_model
+from physgen.sim.mpm.scene_contacts import contact_table
 from physgen.sim.processes import own_mark
 from physgen.sim.scene.folder import load_scene, parse_scene, save_scene, scene_to_json, side_files
 from physgen.sim.scene.meshes import load_object_mesh, load_vertex_track, read_mesh

@@ -316,8 +316,8 @@ def _density(item: SceneObject) -> float:
 
 
 def _contacts(scene: SceneModel) -> ContactTable:
-    # Imported here: it pulls in the preparation of worlds, which reading the options does not need.
-    from ...app.scene_contacts import contact_table
+    # Imported here: reading the options does not need it.
+    from ...mpm.scene_contacts import contact_table
 
     return contact_table(scene)
 

@@ -13,8 +13,8 @@ import itertools
 import math
 from types import MappingProxyType
 
-from ..mpm.surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
 from ..scene.model import Contact, Ground, SceneModel, SceneObject
+from .surface_contact import GROUND_NAME, ContactTable, SurfaceContact, friction_from_roughness
 
 HOLDS = ("separate", "slip", "sticky")
 """Modes by how much they hold; of two surfaces the stronger one counts."""
