@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from ..work import Work
 from .body_mesh import BodyMesh
 from .free_flight import Inertia, State
 from .soft_candidates import WorldParameters
+
+if TYPE_CHECKING:
+    from .element_kernels import NodeState, TrackArrays
 
 Array = NDArray[np.float64]
 
@@ -208,6 +212,43 @@ class SoftWorlds:
             out += self._launch_some([jobs[i] for i in chosen], chosen, frames, laws, keep, shorter)
         return out
 
+    def _nodes(self, jobs: list[SimulationJob], yields: bool) -> NodeState:
+        """The nodes of all ``jobs`` as they start; yields: whether the law has a plastic part."""
+        from .element_kernels import NodeState
+
+        mesh, count, nodes = self.mesh, len(jobs), len(self.mesh.nodes)
+        x, v = np.zeros((count, nodes, 3)), np.zeros((count, nodes, 3))
+        for i, job in enumerate(jobs):
+            inertia = self.inertia_of(job.world)
+            x[i] = job.start.points(inertia, mesh.nodes)
+            v[i] = job.start.velocities(inertia, mesh.nodes)
+        return NodeState(
+            masses=np.stack([self.node_masses(job.world) for job in jobs]),
+            x=x,
+            v=v,
+            f=np.zeros_like(x),
+            plastic=np.tile(np.eye(3), (count if yields else 1, len(mesh.cells) if yields else 1, 1, 1)),
+        )
+
+    def _tracks(self, jobs: list[SimulationJob], frames: int, keep: bool) -> TrackArrays:
+        """Room for the tracked points of all ``jobs`` in ``frames`` frames, and for all nodes if ``keep``."""
+        from .element_kernels import TrackArrays
+
+        count = len(jobs)
+        times = np.zeros((count, frames))
+        for i, job in enumerate(jobs):
+            times[i, : len(job.times)] = job.times
+        kept = (count, frames, len(self.mesh.nodes), 3) if keep else (1, 1, 1, 3)
+        return TrackArrays(
+            times=times,
+            counts=np.array([[len(job.times)] for job in jobs], dtype=np.int32),
+            holders=np.ascontiguousarray(self.holders, dtype=np.int32),
+            weights=np.ascontiguousarray(self.weights),
+            tracked=np.zeros((count, frames, len(self.holders), 3)),
+            kept_x=np.zeros(kept),
+            kept_f=np.zeros(kept),
+        )
+
     def _launch_some(
         self,
         jobs: list[SimulationJob],
@@ -220,23 +261,13 @@ class SoftWorlds:
         ensure_started(self._options)
         from . import element_kernels as kernels
 
-        mesh, count, nodes = self.mesh, len(jobs), len(self.mesh.nodes)
+        mesh = self.mesh
         damped, yields, fibred = laws
-        times = np.zeros((count, frames))
-        x, v = np.zeros((count, nodes, 3)), np.zeros((count, nodes, 3))
-        for i, job in enumerate(jobs):
-            times[i, : len(job.times)] = job.times
-            inertia = self.inertia_of(job.world)
-            x[i] = job.start.points(inertia, mesh.nodes)
-            v[i] = job.start.velocities(inertia, mesh.nodes)
-        plastic = np.tile(np.eye(3), (count if yields else 1, len(mesh.cells) if yields else 1, 1, 1))
-        tracked = np.zeros((count, frames, len(self.holders), 3))
-        kept = (count, frames, nodes, 3) if keep else (1, 1, 1, 3)
-        kept_x, kept_f = np.zeros(kept), np.zeros(kept)
         rows = np.stack([self._row(job, shorter) for job in jobs])
         for job, row in zip(jobs, rows, strict=True):
             spans = np.diff(job.times, prepend=row[kernels.START]) / row[kernels.STEP]
             self._work.add(len(mesh.cells) * int(np.maximum(np.ceil(spans - 1e-9), 1).sum()))
+        tracks = self._tracks(jobs, frames, keep)
         kernels.advance_worlds(
             rows,
             damped,
@@ -251,23 +282,10 @@ class SoftWorlds:
                 shares=self._shares,
                 areas=self._areas,
             ),
-            kernels.NodeState(
-                masses=np.stack([self.node_masses(job.world) for job in jobs]),
-                x=x,
-                v=v,
-                f=np.zeros_like(x),
-                plastic=plastic,
-            ),
-            kernels.TrackArrays(
-                times=times,
-                counts=np.array([[len(job.times)] for job in jobs], dtype=np.int32),
-                holders=np.ascontiguousarray(self.holders, dtype=np.int32),
-                weights=np.ascontiguousarray(self.weights),
-                tracked=tracked,
-                kept_x=kept_x,
-                kept_f=kept_f,
-            ),
+            self._nodes(jobs, yields),
+            tracks,
         )
+        tracked, kept_x, kept_f = map(np.asarray, (tracks.tracked, tracks.kept_x, tracks.kept_f))
         return [
             (
                 name,
