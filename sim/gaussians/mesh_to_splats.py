@@ -13,8 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
-from ..mpm.geometry.triangles import face_normals
-from ..reconstruct.user_mesh.mesh_alignment import SurfaceSamples, sample_surface
+from ..mpm.geometry.triangles import SurfaceSamples, face_normals, sample_surface
 from ..scene.textured_mesh import TexturedMesh
 from .splats import MIN_SCALE, Splats
 

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Closed triangle meshes: checks, normals, distances, subdivision. No Taichi; vectorised numpy, deterministic."""
+"""Closed triangle meshes: checks, normals, distances, subdivision, samples. No Taichi; deterministic."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +130,28 @@ def bisected(corners: Array, longest: float, *, box: tuple[Array, Array] | None 
         corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
         owner = np.concatenate([owner, owner])
     return np.concatenate(done), np.concatenate(owners)
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Points on a surface. places: (n, 3); faces: (n) their triangles; weights: (n, 3) barycentric."""
+
+    places: Array
+    faces: NDArray[np.int64]
+    weights: Array
+
+
+def sample_surface(vertices: Array, faces: Faces, count: int) -> SurfaceSamples:
+    """Return ``count`` points evenly over the triangles; deterministic."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    random = np.random.default_rng(0)
+    chosen = np.sort(random.choice(len(faces), size=count, p=areas / areas.sum()))
+    pair = random.random((count, 2))
+    folded = pair.sum(axis=1) > 1
+    pair[folded] = 1 - pair[folded]
+    weights = np.column_stack([1 - pair.sum(axis=1), pair])
+    return SurfaceSamples(np.einsum("nc,nci->ni", weights, vertices[faces[chosen]]), chosen, weights)
 
 
 def squared_distances(places: Array, corners: Array) -> Array:

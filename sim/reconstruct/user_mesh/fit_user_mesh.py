@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from ...mpm.geometry.triangles import sample_surface
 from ...scene.meshes import read_mesh
 from ...scene.model import Camera
 from ..reconstruct_options import UP_AXES, Pixel
 from ..shape.body_texture import CropTexture, TexturedSurface, crop_texture
 from ..shape.inflated_mesh import BodyMesh
 from ..shape.texture_atlas import textured_body
-from .mesh_alignment import Mask, Points, Pose, align, sample_surface
+from .mesh_alignment import Mask, Points, Pose, align
 from .mesh_repair import RepairedMesh, repair_mesh
 
 GRAZING = 0.2

@@ -16,34 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from ...mpm.geometry.triangles import SurfaceSamples, sample_surface
 from ...scene.model import Camera
 from ..camera.ground_camera import on_ground
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class SurfaceSamples:
-    """Points on a surface. places: (n, 3); faces: (n) their triangles; weights: (n, 3) barycentric."""
-
-    places: Points
-    faces: NDArray[np.int64]
-    weights: Points
-
-
-def sample_surface(vertices: Points, faces: Faces, count: int) -> SurfaceSamples:
-    """Return ``count`` points evenly over the triangles; deterministic."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    random = np.random.default_rng(0)
-    chosen = np.sort(random.choice(len(faces), size=count, p=areas / areas.sum()))
-    pair = random.random((count, 2))
-    folded = pair.sum(axis=1) > 1
-    pair[folded] = 1 - pair[folded]
-    weights = np.column_stack([1 - pair.sum(axis=1), pair])
-    return SurfaceSamples(np.einsum("nc,nci->ni", weights, vertices[faces[chosen]]), chosen, weights)
 
 
 @dataclass(frozen=True)
