@@ -199,6 +199,37 @@ def show(scene: bpy.types.Scene, collection: bpy.types.Collection, view: View, c
     scene.view_settings.view_transform, scene.view_settings.look = "Standard", "None"
     scene.view_settings.exposure, scene.view_settings.gamma = 0.0, 1.0
     scene.render.film_transparent = True
+    _lay_over_plate(scene, view.background)
+
+
+PLATE_TREE = "PhysGen Plate"
+
+
+def _lay_over_plate(scene: bpy.types.Scene, plate: bpy.types.Image) -> None:
+    """Let Blender's own renders (F12) have the ``plate`` behind the objects, unless ``scene`` has a compositor of its
+    own. Before Blender 5.0 nothing, as a compositor is no node group there.
+    """
+    if not hasattr(scene, "compositing_node_group"):
+        return
+    tree = scene.compositing_node_group
+    if tree is not None and MARK not in tree:
+        return
+    if tree is None:
+        tree = scene.compositing_node_group = bpy.data.node_groups.new(PLATE_TREE, "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        tree[MARK] = True
+    tree.nodes.clear()
+    kinds = ("CompositorNodeImage", "CompositorNodeScale", "CompositorNodeRLayers", "CompositorNodeAlphaOver")
+    picture, scale, render, over, output = (tree.nodes.new(kind) for kind in (*kinds, "NodeGroupOutput"))
+    for node, place in ((scale, (200, 150)), (render, (100, -150)), (over, (450, 0)), (output, (650, 0))):
+        node.location = place
+    picture.image, picture.location = plate, (-100, 150)
+    # As large as the render, whatever its percentage is.
+    scale.inputs["Type"].default_value, scale.inputs["Frame Type"].default_value = "Render Size", "Stretch"
+    tree.links.new(picture.outputs["Image"], scale.inputs["Image"])
+    tree.links.new(scale.outputs["Image"], over.inputs["Background"])
+    tree.links.new(render.outputs["Image"], over.inputs["Foreground"])
+    tree.links.new(over.outputs["Image"], output.inputs["Image"])
 
 
 def data_of(item: bpy.types.Object) -> set[bpy.types.ID]:

@@ -24,7 +24,9 @@ from physgen.physgen_addon.operators.reconstruct_ops import PHYSGEN_OT_reconstru
 from physgen.physgen_addon.photo.photo_image import load_photo_image
 from physgen.physgen_addon.photo.photo_request import arguments, scene_folder
 from physgen.physgen_addon.props.material_props import get_material
+from physgen.physgen_addon.render import look_nodes
 from physgen.physgen_addon.scene_io import import_scene as bridge
+from physgen.physgen_addon.scene_io import photo_view
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import Scene, load_scene, save_scene
 from physgen.sim.scene.material import load_preset
@@ -147,7 +149,8 @@ def test_cycles_renders_the_photo_again(copy, world, tmp_path):
     scene = bpy.context.scene
     bridge.import_scene(scene, copy.root)
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
-    scene.render.filepath = str(tmp_path / "seen.png")
+    # Without the plate behind the objects.
+    scene.render.use_compositing, scene.render.filepath = False, str(tmp_path / "seen.png")
     scene.render.image_settings.file_format = "PNG"
     bpy.ops.render.render(write_still=True)
     seen = np.asarray(Image.open(tmp_path / "seen.png").convert("RGBA")).astype(float)
@@ -469,6 +472,33 @@ def test_a_photo_becomes_a_scene_in_the_worker(world, tmp_path):
     assert max(item.dimensions) == pytest.approx(0.1, rel=0.01)
     assert load_scene(tmp_path / "ball_scene").model.objects[0].name == item.physgen.source
     assert (scene.render.resolution_x, scene.render.resolution_y) == (160, 120)
+
+
+@pytest.mark.skipif(not look_nodes.available(), reason="compositor node groups are Blender 5.0's")
+def test_blenders_own_render_has_the_plate_behind_the_objects(copy, tmp_path):
+    """F12, at half the size: the plate, the ball before it; a compositor of one's own is left alone."""
+    scene = bpy.context.scene
+    for _ in range(2):
+        bridge.import_scene(scene, copy.root)
+    scene.render.engine, scene.cycles.samples = "CYCLES", 4
+    scene.render.resolution_percentage, scene.render.dither_intensity = 50, 0.0
+    scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(tmp_path / "out.png")
+    bpy.ops.render.render(write_still=True)
+    seen = np.asarray(Image.open(tmp_path / "out.png").convert("RGB")).astype(float)
+    plate, photo = (
+        np.asarray(Image.open(copy.file(name)).convert("RGB").resize((80, 60), Image.Resampling.BOX)).astype(float)
+        for name in copy.model.photo_files[::-1]
+    )
+    ball = np.asarray(Image.open(copy.file("masks/ball.png")).resize((80, 60), Image.Resampling.BOX))
+    # The ground's far corners have neither shadow nor ball.
+    for corner in (np.s_[:12, :12], np.s_[:12, -12:]):
+        assert np.abs(seen[corner] - plate[corner]).mean() < 4
+    assert np.abs(seen - photo)[ball == 255].mean() < 0.25 * np.abs(plate - photo)[ball == 255].mean()
+    assert len([tree for tree in bpy.data.node_groups if tree.name.startswith(photo_view.PLATE_TREE)]) == 1
+    own = bpy.data.node_groups.new("mine", "CompositorNodeTree")
+    scene.compositing_node_group = own
+    bridge.import_scene(scene, copy.root)
+    assert scene.compositing_node_group == own and not own.nodes
 
 
 def test_a_reconstructed_motion_starts_at_the_frames_of_its_own_slow_motion(copy):
