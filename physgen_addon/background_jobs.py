@@ -21,7 +21,7 @@ from ..sim.events import Event, IsCancelled, OnEvent
 from .compat import OperatorMixin
 from .context import TAB, redraw, scene_with
 from .interpreter import NoPython
-from .text import duration, popup
+from .text import duration, popup, without_options
 
 Work = Callable[[OnEvent, IsCancelled], Event]
 """The work of a job: called in a thread, without bpy; forwards events and returns the final event, or raises."""
@@ -313,7 +313,9 @@ class JobOperator(OperatorMixin):
     def _fail(self, scene: bpy.types.Scene, error: PhysGenError) -> None:
         # A command is nothing for a popup: it is in the preferences, and buttons are in the panel.
         words = str(error)
-        if isinstance(error, NoPython) and not bpy.app.background:
+        if not isinstance(error, NoPython):
+            words = without_options(words)
+        elif not bpy.app.background:
             words = f"{error.reason} (see Scene in the tab {TAB})"
         is_stop = isinstance(error, Cancelled)
         self.report({"WARNING" if is_stop else "ERROR"}, words if is_stop else popup(words))
@@ -326,7 +328,7 @@ class JobOperator(OperatorMixin):
             self._fail(scene, error)
             return {"CANCELLED"}
         for notice in self._job.notices[-3:]:
-            self.report({"INFO"}, notice)
+            self.report({"INFO"}, without_options(notice))
         self.report({"INFO"}, sentence)
         return {"CANCELLED"} if self._job.undone and self.keeps_redo else {"FINISHED"}
 

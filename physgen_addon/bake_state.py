@@ -89,7 +89,7 @@ def state(scene: bpy.types.Scene) -> BakeState:
     return found
 
 
-UNBAKED = "Nothing moves before you press Bake"
+UNBAKED = "Press Bake: nothing moves yet"
 
 
 def unbaked(scene: bpy.types.Scene) -> str:

@@ -36,6 +36,20 @@ def popup(message: str) -> str:
     return " \n".join(part for wrapped in lines for part in wrapped)
 
 
+_OPTION = re.compile(r"(?<!\S)--[a-z]")
+_IN_BRACKETS = re.compile(r"\s*\((?=--[a-z])[^()]*\)")
+
+
+def without_options(message: str) -> str:
+    """Return ``message`` without the brackets and clauses that name options of the command line, which Blender's user
+    does not have; unchanged if nothing else would be left.
+    """
+    parts = re.split(r"([.;] )", _IN_BRACKETS.sub("", message))
+    clauses = zip(parts[::2], [*parts[1::2], ""], strict=True)
+    kept = "".join(clause + end for clause, end in clauses if not _OPTION.search(clause)).rstrip(" ;.")
+    return kept or message
+
+
 Execute = Callable[[Any, bpy.types.Context], set[str]]
 
 

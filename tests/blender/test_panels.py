@@ -259,6 +259,27 @@ def test_pins_that_lost_their_box():
 # -- words and pictures -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (
+            "none was given, so book hops 9 cm high; 2.5 times slower than real, 4.2 s. Change it with --velocity, "
+            "--slow; --still leaves everything at rest",
+            "none was given, so book hops 9 cm high; 2.5 times slower than real, 4.2 s",
+        ),
+        (
+            "photo.jpg: no object stands out in it; draw a box around each one (--box x0,y0,x1,y1)",
+            "photo.jpg: no object stands out in it; draw a box around each one",
+        ),
+        ("cut-outs: by isnet; --segmenter none cuts out by colour", "cut-outs: by isnet"),
+        ("--pick 3: give numbers from 1 to 2", "--pick 3: give numbers from 1 to 2"),
+        ("/home/a--b/photo.jpg: is no photo (of 3 bytes)", "/home/a--b/photo.jpg: is no photo (of 3 bytes)"),
+    ],
+)
+def test_options_of_the_command_line_are_not_said_in_blender(said, shown):
+    assert text.without_options(said) == shown
+
+
 def test_popups_are_broken_into_lines_where_there_is_a_window(monkeypatch):
     message = "a word and another " * 20 + "\n" + "x" * 200
     assert text.popup(message) == message
