@@ -169,7 +169,7 @@ def unregister_photo_menu() -> None:
 
 
 CHOSEN, OTHER, DRAGGED = (1.0, 0.55, 0.1, 1.0), (1.0, 1.0, 1.0, 0.8), (1.0, 0.8, 0.2, 1.0)
-UNDER = (0.0, 0.0, 0.0, 0.7)
+UNDER = (0.0, 0.0, 0.0, 0.9)
 """Below lines and names, which are else lost on photos of their own colour."""
 _dragged: list[tuple[int, int, int, int]] = []
 """The rectangle being dragged, at most one; not stored in any file."""
@@ -269,7 +269,7 @@ def _draw_boxes() -> None:
     lines += [(corners, DRAGGED, "") for corners in _dragged]
     gpu.state.blend_set("ALPHA")
     blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 3, *UNDER)
+    blf.shadow(0, 6, *UNDER)
     for (x0, y0, x1, y1), colour, name in lines:
         places = [
             on_screen(context.region, x / state.width, y / state.height)
