@@ -66,6 +66,9 @@ def found_words(scene: bpy.types.Scene, found: list[Proposal], added: int) -> st
     return f"{count(added, 'box')} added{more}. Name them, then Reconstruct"
 
 
+EVERY = "Add a box around every object found, up to 20"
+
+
 class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
     """Find the objects of the photo that stand out, and add a box around the best of them"""
 
@@ -74,7 +77,12 @@ class PHYSGEN_OT_find_objects(JobOperator, bpy.types.Operator):
     bl_options = {"UNDO"}  # noqa: RUF012
     job_title = "Finding objects"
 
-    every: BoolProperty(name="All", description="Add a box around every object found, up to 20", options={"SKIP_SAVE"})
+    every: BoolProperty(name="All", description=EVERY, options={"SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        """Return the tooltip of *All*; empty for the operator's own."""
+        return EVERY if properties.every else ""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

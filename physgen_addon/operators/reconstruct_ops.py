@@ -66,9 +66,7 @@ class PHYSGEN_OT_trust_file(bpy.types.Operator):
 
 
 class PHYSGEN_OT_reconstruct(JobOperator, bpy.types.Operator):
-    """Reconstruct a scene from the photo: segment the objects, inpaint the background, estimate camera, ground
-    and light
-    """
+    """Make a scene of the photo: cut the objects out, fill the places behind them, estimate camera, ground and light"""
 
     bl_idname = "physgen.reconstruct"
     bl_label = "Reconstruct"

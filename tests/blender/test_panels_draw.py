@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from physgen import physgen_addon
 from physgen.physgen_addon import background_jobs, bake_state, handlers, text
 from physgen.physgen_addon.context import TAB
-from physgen.physgen_addon.operators.photo_object_ops import add_found, found_words
+from physgen.physgen_addon.operators.photo_object_ops import PHYSGEN_OT_find_objects, add_found, found_words
 from physgen.physgen_addon.operators.photo_ops import add_box
 from physgen.physgen_addon.panels import sidebar, simulate_panel
 from physgen.physgen_addon.props.scene_props import EFFECT_ITEMS
@@ -381,6 +381,13 @@ def test_a_box_that_has_no_name_yet_is_to_get_one():
     assert "write what it is" not in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
     box.name, box.kind = "object 1", "cup"
     assert "write what it is" not in " ".join(draw_all("PT_scene")["PHYSGEN_PT_scene"].words)
+
+
+def test_both_buttons_that_find_objects_say_what_they_do():
+    every, best = (
+        PHYSGEN_OT_find_objects.description(bpy.context, SimpleNamespace(every=every)) for every in (True, False)
+    )
+    assert "every object" in every and best == ""
 
 
 def test_found_objects_are_reported_by_what_to_do_next():
