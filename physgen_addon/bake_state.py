@@ -100,14 +100,25 @@ def unbaked(scene: bpy.types.Scene) -> str:
     is_alone = len(moving) == len(bodies(scene)) and not scene.physgen.world.effects
     if is_alone and all(_stays(item) for item in moving):
         return "Everything is at rest: give an object a velocity (see Motion), then Bake"
-    started = [item for item in moving if item.physgen.waits and not _stays(item)]
-    starts = [f"{item.name} at frame {item.physgen.start_frame}" for item in started]
+    starts = [words for item in moving if not _stays(item) and (words := _starts(item))]
     return f"{UNBAKED}. Start: {', '.join(starts)}" if starts else UNBAKED
+
+
+def _starts(item: bpy.types.Object) -> str:
+    """Return in words at which frames ``item`` starts and is pushed again; empty if it just starts with the others."""
+    body = item.physgen
+    frames = [push.frame for push in body.pushes]
+    if not (frames or body.waits):
+        return ""
+    first = [body.start_frame] if body.waits or any(body.velocity) or any(body.spin) else []
+    numbers = [str(frame) for frame in sorted(first + frames)]
+    told = numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}"
+    return f"{item.name} at frame{'s' if len(numbers) > 1 else ''} {told}"
 
 
 def _stays(item: bpy.types.Object) -> bool:
     body = item.physgen
-    return body.asleep and not (any(body.velocity) or any(body.spin) or body.pins)
+    return body.asleep and not (any(body.velocity) or any(body.spin) or body.pushes or body.pins)
 
 
 def last_seen(scene: bpy.types.Scene) -> BakeState | None:

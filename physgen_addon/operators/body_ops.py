@@ -12,6 +12,7 @@ from ..props import material_props
 from ..props.body_props import bodies, is_body
 from ..props.material_props import CUSTOM, get_material, set_material
 from ..scene_io import stand_ins
+from ..scene_io.export_animation import metres_per_unit
 from ..scene_io.export_meshes import mesh_trouble, rest_bounds
 from ..scene_io.export_scene import SUNK
 from ..text import count, report_errors
@@ -21,6 +22,8 @@ PIN_MARK = "physgen_pin"
 """Custom property of the empties made by "Add Pin"; only those are deleted with their pin."""
 UPPER_PART = 0.25
 """Share of the object's height that a new pin holds."""
+UPWARDS = 1.0
+"""Speed in m/s of a push of what has no velocity to repeat."""
 _MARGIN = 0.02
 """Margin of a pin beyond the surface, as a share of the object's size."""
 
@@ -229,7 +232,7 @@ class OfBody(OperatorMixin):
 
 
 class PHYSGEN_OT_clear_motion(OfBody, bpy.types.Operator):
-    """Reset the initial motion: no velocity, no spin, no start frame"""
+    """Reset the motion: no velocity, no spin, no start frame, no later pushes"""
 
     bl_idname = "physgen.clear_motion"
     bl_label = "Clear"
@@ -238,6 +241,44 @@ class PHYSGEN_OT_clear_motion(OfBody, bpy.types.Operator):
         """Restore the defaults."""
         for name in ("velocity", "spin", "start_frame"):
             active(context).physgen.property_unset(name)
+        active(context).physgen.pushes.clear()
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_add_push(OfBody, bpy.types.Operator):
+    """Push the object once more, at the current frame, or a second of the clip after its last push if that is later"""
+
+    bl_idname = "physgen.add_push"
+    bl_label = "Add Push"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Add a push with the velocity of the last one; upwards where nothing has been pushed yet."""
+        body, scene = active(context).physgen, context.scene
+        last = max(body.pushes, key=lambda push: push.frame, default=None)
+        start = max(body.start_frame, scene.physgen.simulation.frame_start)
+        after = (start if last is None else last.frame) + max(1, round(scene.render.fps / scene.render.fps_base))
+        velocity = tuple((last or body).velocity)
+        push = body.pushes.add()
+        push.frame = scene.frame_current if scene.frame_current > (last.frame if last else start) else after
+        push.velocity = velocity if any(velocity) else (0.0, 0.0, UPWARDS / metres_per_unit(scene))
+        body.push_index = len(body.pushes) - 1
+        return {"FINISHED"}
+
+
+class PHYSGEN_OT_remove_push(OfBody, bpy.types.Operator):
+    """Remove the active push"""
+
+    bl_idname = "physgen.remove_push"
+    bl_label = "Remove Push"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove the entry."""
+        body = active(context).physgen
+        if not 0 <= body.push_index < len(body.pushes):
+            self.report({"WARNING"}, "There is no push to remove")
+            return {"CANCELLED"}
+        body.pushes.remove(body.push_index)
+        body.push_index = max(min(body.push_index, len(body.pushes) - 1), 0)
         return {"FINISHED"}
 
 

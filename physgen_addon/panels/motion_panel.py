@@ -12,10 +12,13 @@ from mathutils import Vector
 from .. import text
 from ..operators.body_ops import (
     PHYSGEN_OT_add_pin,
+    PHYSGEN_OT_add_push,
     PHYSGEN_OT_clear_motion,
     PHYSGEN_OT_remove_pin,
+    PHYSGEN_OT_remove_push,
 )
 from ..props.body_props import bodies
+from ..scene_io.export_animation import metres_per_unit
 from .objects_panel import DynamicPart
 from .sidebar import (
     MOTION,
@@ -48,6 +51,26 @@ class PHYSGEN_UL_pins(bpy.types.UIList):
         row.prop(item, "box", text="", icon="CUBE")
         if row.alert:
             row.label(text="", icon="ERROR")
+
+
+class PHYSGEN_UL_pushes(bpy.types.UIList):
+    """List of later pushes."""
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+    ) -> None:
+        """Draw the frame and the speed."""
+        row = layout.row(align=True)
+        row.prop(item, "frame", text="Frame", emboss=False)
+        speed = text.number(Vector(item.velocity).length * metres_per_unit(context.scene), "m/s")
+        row.label(text=speed)
 
 
 class PHYSGEN_PT_motion(Sidebar, bpy.types.Panel):
@@ -107,12 +130,45 @@ class PHYSGEN_PT_start(DynamicPart, bpy.types.Panel):
             column.prop(body, "held")
 
 
+class PHYSGEN_PT_pushes(DynamicPart, bpy.types.Panel):
+    """When the active object is pushed again"""
+
+    bl_parent_id = "PHYSGEN_PT_motion"
+    bl_label = "Later Pushes"
+    bl_order = 1
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+
+    def draw_header(self, context: bpy.types.Context) -> None:
+        """Draw their frames, which tell of a motion that is still to come, also while this is closed."""
+        frames = sorted(push.frame for push in active_body(context).physgen.pushes)
+        if frames:
+            self.layout.label(text=f"({', '.join(map(str, frames))})")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the list and the active push."""
+        layout, body = self.layout, active_body(context).physgen
+        locked = settings(layout, context)
+        if not body.pushes:
+            text.sentences(locked, context, "A push gives it a velocity at a later frame: it hops again.")
+            locked.operator(PHYSGEN_OT_add_push.bl_idname, icon="ADD")
+            return
+        row = locked.row()
+        row.template_list("PHYSGEN_UL_pushes", "", body, "pushes", body, "push_index", rows=2)
+        side = row.column(align=True)
+        side.operator(PHYSGEN_OT_add_push.bl_idname, text="", icon="ADD")
+        side.operator(PHYSGEN_OT_remove_push.bl_idname, text="", icon="REMOVE")
+        if body.push_index < len(body.pushes):
+            push = body.pushes[body.push_index]
+            locked.prop(push, "frame")
+            locked.prop(push, "velocity")
+
+
 class PHYSGEN_PT_pins(DynamicPart, bpy.types.Panel):
     """Pins of the active object"""
 
     bl_parent_id = "PHYSGEN_PT_motion"
     bl_label = "Hold"
-    bl_order = 1
+    bl_order = 2
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context: bpy.types.Context) -> None:

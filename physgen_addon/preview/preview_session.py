@@ -8,7 +8,7 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,9 @@ from .preview_worker import Client, Clip
 UNSET = ("friction", "static_friction", "restitution", "contact_mode", "shell_thickness")
 """Properties of an object that are omitted unless set."""
 
+OFF: Mapping[str, Any] = {"asleep": False, "held": False, "velocity_keys": ()}
+"""Values of others that are omitted."""
+
 
 def watched_numbers(scene: bpy.types.Scene) -> tuple[str, ...]:
     """Return all values that can be passed to the worker without a new export, as overrides of the exported scene.
@@ -40,7 +43,7 @@ def watched_numbers(scene: bpy.types.Scene) -> tuple[str, ...]:
     unit, times, names = metres_per_unit(scene), clock(scene), export_names(scene)
     found = []
     for item in bodies(scene):
-        fields: dict[str, Any] = {**dict.fromkeys(UNSET), "asleep": False, "held": False, **physics(item, unit, times)}
+        fields: dict[str, Any] = {**dict.fromkeys(UNSET), **OFF, **physics(item, unit, times)}
         fields.pop("role")
         material = fields.pop("material", None)
         if material is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Simulation properties of an object: role, surface, material, initial motion, pins."""
+"""Simulation properties of an object: role, surface, material, initial motion, later pushes, pins."""
 
 import bpy
 from bpy.props import (
@@ -68,6 +68,28 @@ class PHYSGEN_PG_pin(bpy.types.PropertyGroup):
         ),
         type=bpy.types.Object,
         poll=_is_empty,
+    )
+
+
+class PHYSGEN_PG_push(bpy.types.PropertyGroup):
+    """A later push of the object: the velocity that it has from a frame on."""
+
+    frame: IntProperty(
+        name="Frame",
+        description="The object is pushed at this frame, and free again after it",
+        default=24,
+        min=0,
+        soft_max=250,
+    )
+    velocity: from_field(
+        SceneObject,
+        "velocity",
+        "Velocity",
+        "Velocity that the push gives to the object as a whole",
+        subtype="VELOCITY",
+        unit="VELOCITY",
+        soft_min=-10.0,
+        soft_max=10.0,
     )
 
 
@@ -229,6 +251,8 @@ class PHYSGEN_PG_body(Surface, bpy.types.PropertyGroup):
         min=0,
         soft_max=250,
     )
+    pushes: CollectionProperty(type=PHYSGEN_PG_push)
+    push_index: IntProperty(name="Push", description="Active push")
     waits: switch("start_frame", "Waits", "Starts at a frame of its own; off: with the simulation", 2)
     asleep: from_field(
         SceneObject,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...sim.constitutive import FLUID, RIGID, cohesion_of, model_of
 from ...sim.errors import InputError
-from ...sim.scene.model import Effect, Material, MaterialTrack, NumberKey
+from ...sim.scene.model import Effect, Key, Keys, Material, MaterialTrack, NumberKey
 from ..props.material_props import get_material
 from ..text import decimal
 from .export_animation import Clock, channels, scaled, why_it_moves
@@ -213,9 +213,27 @@ def physics(item: bpy.types.Object, unit: float, clock: Clock) -> dict[str, Any]
         if getattr(body, name):
             fields[name] = True
     fields["start_time"] = clock.from_frame(body.start_frame)
+    if body.pushes:
+        fields["velocity_keys"] = _pushes(item, unit, clock)
     fields["goal_stiffness"] = decimal(body.goal_stiffness)
     fields["goal_damping"] = decimal(body.goal_damping)
     return fields
+
+
+def _pushes(item: bpy.types.Object, unit: float, clock: Clock) -> Keys:
+    """Return the later pushes of ``item`` in the order of their frames; velocities in m/s, ``unit`` in metres."""
+    body = item.physgen
+    last, what = max(body.start_frame, clock.start), "it starts"
+    found = []
+    for push in sorted(body.pushes, key=lambda push: push.frame):
+        if push.frame <= last:
+            raise InputError(
+                f"object {item.name!r}: is pushed at frame {push.frame}, but {what} at frame {last}: push it later "
+                "(Motion > Later Pushes), or remove that push"
+            )
+        found.append(Key(time_s=clock.seconds(push.frame), value=scaled(push.velocity, unit)))
+        last, what = push.frame, "is already pushed"
+    return tuple(found)
 
 
 def sand(item: bpy.types.Object, name: str, clock: Clock) -> list[Effect]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,7 @@ def fill_body(
     body.velocity, body.spin = source.velocity, source.spin
     body.asleep, body.held = source.asleep, source.held
     body.start_frame = first + round(source.start_time * rate) if source.start_time > 0 else 0
+    _fill_pushes(body, source.velocity_keys, first, rate)
     body.goal_stiffness, body.goal_damping = source.goal_stiffness, source.goal_damping
     _fill_surface(body, source, ground)
     for number, box in enumerate(source.pins, start=1):
@@ -112,8 +114,6 @@ def fill_body(
         notes.append(f"{source.name} is held along a path in the folder; here it is held in place")
     if source.acceleration:
         notes.append(f"{source.name} has an acceleration over time in the folder; here it has none")
-    if source.velocity_keys:
-        notes.append(f"{source.name} is pushed again later in the folder; here it is only at its start")
     if source.material_tracks:
         changing = ", ".join(track.field for track in source.material_tracks)
         notes.append(f"{source.name} has {changing} over time in the folder; here they stay")
@@ -124,6 +124,14 @@ def fill_body(
         notes.append(f"{source.name} deforms by {source.motion.vertices_file} in the folder; here it stands still")
     elif source.motion is not None:
         _animate_collider(item, source.motion, first, rate)
+
+
+def _fill_pushes(body: bpy.types.PropertyGroup, keys: Keys, first: int, rate: float) -> None:
+    """Turn ``keys`` into pushes at whole frames, one a frame; one at the object's first frame is its velocity."""
+    start = max(first, body.start_frame)
+    by_frame = {first + round(key.time_s * rate): key.value for key in keys}
+    body.velocity = by_frame.get(start, body.velocity)
+    _set_pushes(body, [[frame, *velocity] for frame, velocity in by_frame.items() if frame > start])
 
 
 def fill_material(target: bpy.types.PropertyGroup, material: Material) -> None:
@@ -286,7 +294,9 @@ def restore_edits(scene: bpy.types.Scene, changed: Fields) -> None:
         target = _owner(scene, owner)
         if target is None:
             continue
-        if field == "pins":
+        if field == "pushes":
+            _set_pushes(target, value)
+        elif field == "pins":
             _set_pins(scene, target, value)
         elif field == "effects":
             _set_effects(scene, target, value)
@@ -304,6 +314,7 @@ def _all(scene: bpy.types.Scene) -> Fields:
             name = item.physgen.source
             found |= _read(f"body:{name}", item.physgen, OF_BODY)
             found |= _read(f"material:{name}", item.physgen.material, OF_MATERIAL)
+            found[f"body:{name}/pushes"] = [[push.frame, *push.velocity] for push in item.physgen.pushes]
             found[f"body:{name}/pins"] = [pin.box.name for pin in item.physgen.pins if pin.box is not None]
     found |= _read("world", world, OF_WORLD) | _read("scene", scene, OF_SCENE)
     found["world/effects"] = [_effect(entry) for entry in world.effects]
@@ -344,6 +355,14 @@ def _owner(scene: bpy.types.Scene, owner: str) -> Any:
 
 def _of_source(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
     return next((item for item in bodies(scene) if item.physgen.source == name), None)
+
+
+def _set_pushes(body: Any, rows: Sequence[Sequence[float]]) -> None:
+    """Replace the pushes of ``body`` by one for each of ``rows`` (4): the frame, and the velocity."""
+    body.pushes.clear()
+    for frame, *velocity in rows:
+        push = body.pushes.add()
+        push.frame, push.velocity = int(frame), velocity
 
 
 def _set_pins(scene: bpy.types.Scene, body: Any, names: list[str]) -> None:

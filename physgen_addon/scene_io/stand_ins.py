@@ -74,6 +74,8 @@ def unpack(scene: bpy.types.Scene, item: bpy.types.Object) -> list[bpy.types.Obj
             copy.matrix_world = shift @ part.matrix_world
         body, turn = copy.physgen, shift.to_quaternion()
         body.velocity, body.spin = turn @ Vector(body.velocity), turn @ Vector(body.spin)
+        for push in body.pushes:
+            push.velocity = turn @ Vector(push.velocity)
         for pin in body.pins:
             pin.box = copies.get(pin.box, pin.box)
     bpy.data.objects.remove(item)

@@ -300,6 +300,8 @@ def test_manual_changes_survive_a_new_reconstruction(world, tmp_path):
     for own in (ramp, pin):
         scene.collection.objects.link(own)
     body.pins.add().box = pin
+    push = body.pushes.add()
+    push.frame, push.velocity = 40, (0.0, 0.5, 0.0)
     scene.gravity = (0.0, 0.0, -1.6)
     for name, target in (("wind", item), ("air_drag", ramp)):
         entry = world_state.effects.add()
@@ -321,6 +323,7 @@ def test_manual_changes_survive_a_new_reconstruction(world, tmp_path):
     assert tuple(body.velocity) == (1, 2, 3) and tuple(body.spin) == (0, 0, 5)
     assert (body.friction, body.static_friction) == (pytest.approx(0.7), pytest.approx(0.9)) and body.own_surface
     assert [entry.box for entry in body.pins] == [pin]
+    assert [(entry.frame, *entry.velocity) for entry in body.pushes] == [(40, 0, 0.5, 0)]
     assert scene.gravity[2] == pytest.approx(-1.6)
     # The other one's only object is gone.
     (entry,) = world_state.effects
@@ -335,6 +338,7 @@ def test_manual_changes_survive_a_new_reconstruction(world, tmp_path):
 def test_every_field_of_a_body_is_kept_or_belongs_to_the_import():
     kept = {name for names in import_physics.OF_BODY for name in names}
     others = {"rna_type", "name", "enabled", "source", "cache", "material", "speed", "pins", "pin_index", "original"}
+    others |= {"pushes", "push_index"}  # Kept, as the pins are.
     # Ways to show and set the number or the choice that is kept.
     others |= {"surface", "own_wall", "waits", "holds_shape"}
     assert set(PHYSGEN_PG_body.bl_rna.properties.keys()) == kept | others

@@ -33,6 +33,28 @@ def scene():
 # Numbers
 
 
+def test_pushes_are_in_the_order_of_their_frames_and_later_than_the_start(scene, tmp_path):
+    settings = scene.physgen.simulation
+    settings.frame_start, settings.frame_end = 11, 60
+    scene.render.fps, scene.render.fps_base = 25, 1.0
+    scene.unit_settings.scale_length = 0.1
+    body = add(place=(0.0, 0.0, 10.0)).physgen
+    for frame, speed in ((41, 3.0), (31, 5.0)):
+        push = body.pushes.add()
+        push.frame, push.velocity = frame, (0.0, 0.0, speed)
+    _, objects = exported(scene, tmp_path)
+    assert [(key.time_s, key.value) for key in objects["Cube"].velocity_keys] == [
+        *((0.8, (0.0, 0.0, 0.5)), (1.2, (0.0, 0.0, 0.3))),
+    ]
+    body.pushes[0].frame = 31
+    refused(scene, tmp_path / "twice", "'Cube'", "frame 31", "already pushed")
+    body.pushes[0].frame, body.start_frame = 41, 35
+    refused(scene, tmp_path / "early", "'Cube'", "frame 31", "starts at frame 35")
+    body.role = "collider"
+    add("Other", (3.0, 0.0, 10.0))
+    assert exported(scene, tmp_path, "collider")[1]["Cube"].velocity_keys == ()
+
+
 def test_the_numbers_of_an_object(scene, tmp_path):
     settings = scene.physgen.simulation
     settings.frame_start, settings.frame_end = 11, 20

@@ -27,6 +27,7 @@ from physgen.physgen_addon.props.material_props import get_material
 from physgen.physgen_addon.render import look_nodes
 from physgen.physgen_addon.scene_io import import_scene as bridge
 from physgen.physgen_addon.scene_io import photo_view
+from physgen.physgen_addon.scene_io.export_scene import export_scene
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import Scene, load_scene, save_scene
 from physgen.sim.scene.material import load_preset
@@ -514,10 +515,27 @@ def test_a_reconstructed_motion_starts_at_the_frames_of_its_own_slow_motion(copy
     assert words.startswith("1 object imported")
 
 
-def test_a_second_push_of_an_object_is_reported_as_what_it_is(copy):
-    folder = changed(copy, velocity=(0.0, 0.0, 1.0), velocity_keys=(Key(time_s=1.0, value=(0.1, 0.0, 0.0)),))
-    notes = bridge.import_notes(bridge.import_scene(bpy.context.scene, folder.root))
-    assert "ball is pushed again later in the folder; here it is only at its start" in notes
+def test_every_push_of_a_motion_comes_to_blender_and_goes_back_as_it_was(copy, tmp_path):
+    """Of the default motion only the first push of an object came, and what was baked was another clip."""
+    keys = (Key(time_s=1.0, value=(0.1, 0.0, 0.0)), Key(time_s=1.75, value=(0.0, 0.0, 2.5)))
+    folder = changed(copy, velocity=(0.0, 0.0, 1.0), start_time=0.25, velocity_keys=keys)
+    scene = bpy.context.scene
+    scene.physgen.simulation.frame_end, scene.physgen.simulation.slow = 150, 2.0
+    collection = bridge.import_scene(scene, folder.root)
+    body = collection.objects["ball"].physgen
+    assert body.start_frame == 13 and [push.frame for push in body.pushes] == [49, 85]
+    assert tuple(body.pushes[1].velocity) == (0, 0, 2.5) and "push" not in " ".join(bridge.import_notes(collection))
+    back = next(item for item in export_scene(scene, tmp_path / "back").model.objects if item.name == "ball")
+    assert (back.velocity, back.start_time, back.velocity_keys) == ((0.0, 0.0, 1.0), 0.25, keys)
+
+
+def test_pushes_at_one_frame_are_the_last_of_them_and_one_at_the_start_is_the_velocity(copy):
+    times = ((0.0, (1.0, 0.0, 0.0)), (0.5, (2.0, 0.0, 0.0)), (1.0, (3.0, 0.0, 0.0)), (1.001, (4.0, 0.0, 0.0)))
+    keys = tuple(Key(time_s=time, value=value) for time, value in times)
+    folder = changed(copy, velocity=(0.0, 0.0, 1.0), start_time=0.5, velocity_keys=keys)
+    body = bridge.import_scene(bpy.context.scene, folder.root).objects["ball"].physgen
+    assert tuple(body.velocity) == (2, 0, 0)
+    assert [(push.frame, *push.velocity) for push in body.pushes] == [(25, 4, 0, 0)]
 
 
 def test_an_output_folder_of_physgen3d_becomes_a_scene_in_the_worker(world, tmp_path):

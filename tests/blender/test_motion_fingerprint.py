@@ -57,6 +57,7 @@ CHANGES = {
     "law": lambda o: setattr(o.physgen.material, "law", "snow"),
     "velocity": lambda o: setattr(o.physgen, "velocity", (0, 0, 2)),
     "start": lambda o: setattr(o.physgen, "start_frame", 5),
+    "push": lambda o: setattr(o.physgen.pushes.add(), "frame", 5),
     "sandy": lambda o: setattr(o.physgen, "sandy", True),
     "role": lambda o: setattr(o.physgen, "role", "collider"),
     "part": lambda o: setattr(o.physgen, "enabled", False),

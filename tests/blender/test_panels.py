@@ -208,8 +208,9 @@ def test_speed_is_the_length_of_the_velocity():
     body.speed = 2
     assert tuple(body.velocity) == pytest.approx((2, 0, 0))
     body.spin, body.start_frame = (1, 1, 1), 7
+    body.pushes.add()
     assert bpy.ops.physgen.clear_motion() == {"FINISHED"}
-    assert body.speed == 0 and tuple(body.spin) == (0, 0, 0) and body.start_frame == 0
+    assert body.speed == 0 and tuple(body.spin) == (0, 0, 0) and body.start_frame == 0 and not body.pushes
 
 
 def test_a_pin_is_a_box_around_the_upper_part():

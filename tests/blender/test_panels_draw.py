@@ -196,6 +196,28 @@ def test_the_first_panel_says_what_to_do_before_a_bake():
     assert bake_state.UNBAKED in bake_state.unbaked(scene)
 
 
+def test_pushes_are_added_after_each_other_and_the_panel_shows_them():
+    scene, body = bpy.context.scene, a_body().physgen
+    scene.frame_set(1)
+    body.velocity, body.start_frame = (0, 0, 2), 10
+    assert "physgen.add_push" in draw_all("PT_pushes")["PHYSGEN_PT_pushes"].names
+    for frame in (1, 1, 90):
+        scene.frame_set(frame)
+        assert bpy.ops.physgen.add_push() == {"FINISHED"}
+    assert [(push.frame, *push.velocity) for push in body.pushes] == [(34, 0, 0, 2), (58, 0, 0, 2), (90, 0, 0, 2)]
+    shown = draw_all("PT_pushes")["PHYSGEN_PT_pushes"]
+    assert {"frame", "velocity", "physgen.remove_push"} <= set(shown.names)
+    assert f"{bpy.context.object.name} at frames 10, 34, 58 and 90" in bake_state.unbaked(scene)
+    body.push_index = 1
+    assert bpy.ops.physgen.remove_push() == {"FINISHED"} and [push.frame for push in body.pushes] == [34, 90]
+    # What is asleep and only pushed later does move.
+    body.velocity, body.start_frame, body.asleep = (0, 0, 0), 0, True
+    assert f"{bpy.context.object.name} at frames 34 and 90" in bake_state.unbaked(scene)
+    body.pushes.clear()
+    assert "at rest" in bake_state.unbaked(scene) and bpy.ops.physgen.remove_push() == {"CANCELLED"}
+    assert bpy.ops.physgen.add_push() == {"FINISHED"} and tuple(body.pushes[0].velocity) == (0, 0, 1)
+
+
 def test_nothing_is_said_of_objects_that_move_or_take_no_part(monkeypatch):
     scene = bpy.context.scene
     assert handlers.why_still(scene) == ""

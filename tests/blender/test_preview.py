@@ -140,6 +140,7 @@ def test_numbers_change_numbers_and_shapes_change_shapes():
     scene = bpy.context.scene
     numbers, shapes = preview_session.watched_numbers(scene), preview_session.watched_shapes(scene)
     ball.physgen.velocity.x = 2.0
+    ball.physgen.pushes.add().velocity.x = 3.0
     ball.physgen.material.density = 500.0
     ball.physgen.own_surface = True
     scene.physgen.world.friction = 0.1
@@ -147,6 +148,7 @@ def test_numbers_change_numbers_and_shapes_change_shapes():
     changed = set(preview_session.watched_numbers(scene)) - set(numbers)
     assert {text.split("=")[0] for text in changed} == {
         "Ball.velocity",
+        "Ball.velocity_keys",
         "Ball.density",
         "Ball.friction",
         "Ball.static_friction",
@@ -156,6 +158,8 @@ def test_numbers_change_numbers_and_shapes_change_shapes():
         "scene.gravity",
     }
     assert preview_session.watched_shapes(scene) == shapes
+    ball.physgen.pushes.clear()
+    assert "Ball.velocity_keys=[]" in preview_session.watched_numbers(scene)
     ball.data.vertices[0].co.x += 0.01
     bent = preview_session.watched_shapes(scene)
     ball.location.x += 1.0

@@ -124,6 +124,7 @@ def test_a_collection_that_was_set_up_takes_part_as_it_was():
         item.physgen.enabled = True
     moving.physgen.material.preset, moving.physgen.velocity, moving.physgen.spin = "sand", (1, 0, 0), (0, 2, 0)
     moving.physgen.pins.add().box = box
+    moving.physgen.pushes.add().velocity = (0, 1, 0)
     ramp.physgen.role, ramp.parent = "collider", moving
     empty = bpy.data.objects.new("instance", None)
     scene.collection.objects.link(empty)
@@ -141,6 +142,7 @@ def test_a_collection_that_was_set_up_takes_part_as_it_was():
     body = found["dynamic"]
     assert body.physgen.material.preset == "sand" and body.data != moving.data
     assert tuple(body.physgen.velocity) == pytest.approx((0, 1, 0), abs=1e-6)
+    assert tuple(body.physgen.pushes[0].velocity) == pytest.approx((-1, 0, 0), abs=1e-6)
     assert tuple(body.physgen.spin) == pytest.approx((-2, 0, 0), abs=1e-6)
     assert tuple(body.matrix_world.translation) == pytest.approx((0, 0, 5), abs=1e-6)
     assert found["collider"].parent == body and body.physgen.pins[0].box in tuple(scene.objects)
