@@ -24,11 +24,11 @@ from . import early_stop  # noqa: F401 - before the modules that take long
 from ..sim import atomic
 from ..sim.app.bake_options import BakeOptions
 from ..sim.app.launch import STOP_SIGNALS
-from ..sim.cache.folder_lock import LOCK_FILE, release_all, remove_dead_lock
 from ..sim.effects.registry import Effect, effect, effect_to_json, effects
 from ..sim.errors import ANYWAY, OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..sim.events import IsCancelled
 from ..sim.files import NOT_UTF8, shown, utf8
+from ..sim.folder_lock import LOCK_FILE, release_all, remove_dead_lock
 from ..sim.memory import ran_out
 from ..sim.processes import kill_children
 from ..sim.trust import LIST_FILE, config_folder

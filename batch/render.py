@@ -83,8 +83,8 @@ def _encode(
 def give_up(options: argparse.Namespace) -> Cancelled:
     """Remove incomplete files when Blender does not stop in time; return the error to report."""
     from ..sim.atomic import remove_unfinished
-    from ..sim.cache.folder_lock import release_all
     from ..sim.errors import Cancelled
+    from ..sim.folder_lock import release_all
 
     remove_unfinished()
     release_all()

@@ -20,9 +20,9 @@ from ..sim.app.reconstruct import Physics, reconstruct, require_physics
 from ..sim.app.stage_process import own_command, run_stage
 from ..sim.atomic import scratch_prefix
 from ..sim.cache.bake_folder import Bake, load_bake
-from ..sim.cache.folder_lock import lock_beside
 from ..sim.errors import RenderError, SimulationError
 from ..sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ..sim.folder_lock import lock_beside
 from ..sim.memory import RENDERING_RESERVED, available_memory, rendering_bytes, require_memory
 from ..sim.reconstruct import ObjectRequest, ReconstructOptions
 from ..sim.reconstruct.reasoning.chat_client import ChatRequest

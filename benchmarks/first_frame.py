@@ -23,11 +23,11 @@ from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.sim.app.reconstruct import reconstruct
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import read_mask, read_rgb
 from physgen.sim.errors import PhysGenError
 from physgen.sim.reconstruct import ObjectRequest
 from physgen.sim.scene.folder import Scene
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.srgb import read_mask, read_rgb
 from PIL import Image
 
 Box = tuple[float, float, float, float]

@@ -32,10 +32,10 @@ from physgen.physgen_addon.render.render_regions import Box
 from physgen.physgen_addon.render.render_scene import add_ground
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
 from physgen.sim.app.reconstruct import reconstruct
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import PhysGenError
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
 from physgen.sim.scene.model import Camera, Ground, Light
+from physgen.sim.srgb import linear_to_bytes
 from PIL import Image
 
 FOV_DEG = 45.0

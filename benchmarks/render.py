@@ -30,10 +30,10 @@ from physgen.physgen_addon.render import lighting, render_engines
 from physgen.physgen_addon.render.render_options import ENGINES, RenderOptions
 from physgen.physgen_addon.render.renderer import Renderer
 from physgen.sim.cache.bake_folder import load_bake
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import PhysGenError
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.model import Camera, Light, SceneModel, SceneObject
+from physgen.sim.srgb import linear_to_bytes
 from PIL import Image
 
 WIDTH, HEIGHT = 640, 480

@@ -12,8 +12,8 @@ from pathlib import Path
 import bpy
 
 from ..sim.cache.bake_folder import MANIFEST_FILE, load_manifest
-from ..sim.cache.folder_lock import LOCK_FILE, is_locked
 from ..sim.errors import InputError
+from ..sim.folder_lock import LOCK_FILE, is_locked
 from . import background_jobs, blend_trust, paths
 from .playback import bake_record, show_bake
 from .playback.bake_record import BakeRecord

@@ -16,9 +16,9 @@ from ...sim.app.propose import LEAST_CLEAR, PICTURE_FILE, choose, propose
 from ...sim.app.reconstruct import correct, reconstruct, require_physics
 from ...sim.app.reconstruct_record import require_request
 from ...sim.cache.bake_folder import load_bake
-from ...sim.cache.folder_lock import lock_beside
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, never
+from ...sim.folder_lock import lock_beside
 from ...sim.importers import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 from ...sim.reconstruct.adapters.adapter_registry import FOLDERS, chosen_segmenter
 from ...sim.reconstruct.models import model_folder

@@ -10,7 +10,7 @@ from ...physgen_addon.frames.frame_index import INDEX_FILE, FrameIndex
 from ...sim.app.reconstruct import set_physics, with_physics
 from ...sim.cache.bake_check import check_bake
 from ...sim.cache.bake_folder import MANIFEST_FILE, disk_usage, free_bake, load_bake
-from ...sim.cache.checksums import UNKNOWN, FileState
+from ...sim.checksums import UNKNOWN, FileState
 from ...sim.errors import InputError
 from ...sim.events import IsCancelled
 from ...sim.files import is_file

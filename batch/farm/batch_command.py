@@ -8,9 +8,9 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...sim.cache.folder_lock import folder_lock
 from ...sim.errors import Cancelled, InputError, PhysGenError, RenderError, SimulationError
 from ...sim.events import IsCancelled
+from ...sim.folder_lock import folder_lock
 from ..terminal import Terminal
 from .job_monitor import SUMMARY_PAGE, Monitor
 from .planning.job_file import load_job

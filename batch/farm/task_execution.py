@@ -27,9 +27,9 @@ from ...sim.app.stage_process import (
     start_process,
 )
 from ...sim.atomic import recover
-from ...sim.cache.folder_lock import is_held
 from ...sim.errors import Cancelled, InputError, PhysGenError
 from ...sim.events import Event, IsCancelled, OnEvent, ignore, never
+from ...sim.folder_lock import is_held
 from ...sim.memory import how_it_was_killed, memory_kills
 from ...sim.scene.folder import inside
 from ...sim.version import VERSION

@@ -24,10 +24,10 @@ from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.physgen_addon.render.render_regions import Box
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
 from physgen.sim.atomic import replacing
-from physgen.sim.composite.srgb import linear_to_srgb, srgb_to_linear
 from physgen.sim.gaussians.views.posed_images import View, over_white
 from physgen.sim.gaussians.views.view_files import save_views
 from physgen.sim.scene.model import Camera
+from physgen.sim.srgb import linear_to_srgb, srgb_to_linear
 
 from .asset import Asset, Part
 from .catalogue import NAMES, asset

@@ -27,7 +27,7 @@ from physgen.physgen_addon.render import render_engines
 from physgen.physgen_addon.render.render_options import RenderOptions
 from physgen.physgen_addon.render.render_regions import Box
 from physgen.physgen_addon.scene_io import photo_view as bridge_camera
-from physgen.sim.composite.srgb import linear_to_bytes
+from physgen.sim.srgb import linear_to_bytes
 from PIL import Image
 
 from . import blender_materials, scoring

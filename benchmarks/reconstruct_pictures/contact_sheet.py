@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.srgb import read_rgb
 
 from .scoring import Row, Truth, alias, found_masks, mesh_silhouette
 

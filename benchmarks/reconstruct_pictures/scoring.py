@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import nearest, read_mask, read_rgb
 from physgen.sim.scene.folder import Scene, load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Camera
+from physgen.sim.srgb import nearest, read_mask, read_rgb
 
 from .shapes import PLAIN_SOLIDS
 

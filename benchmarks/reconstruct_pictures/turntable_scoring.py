@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.reconstruct import turntable
 from physgen.sim.reconstruct.turntable import Turned
 from physgen.sim.scene.folder import Scene
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 from PIL import Image
 
 from .cases import Case

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from ...sim import srgb
 from ...sim.atomic import replacing
-from ...sim.composite import srgb
 from ...sim.errors import Cancelled, InputError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..render.render_options import SHEET_SUFFIXES

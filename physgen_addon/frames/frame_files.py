@@ -13,8 +13,8 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from ...sim import srgb
 from ...sim.atomic import replacing
-from ...sim.composite import srgb
 from ...sim.composite.compositing import FrameLayers
 from ...sim.errors import InputError, openimageio_error
 from ...sim.files import MAX_PICTURE_BYTES, require_file

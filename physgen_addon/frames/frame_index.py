@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...sim.atomic import write_json
-from ...sim.cache.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState
+from ...sim.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState
 from ...sim.errors import InputError
 from ...sim.scene.folder import file_hash
 from ...sim.scene.scene_output import folder_kind

@@ -9,9 +9,9 @@ from pathlib import Path
 import bpy
 
 from ...sim.cache.bake_folder import SURFACE, WORLD_SPACE, Bake, BakeManifest
-from ...sim.cache.folder_lock import is_locked
 from ...sim.cache.pc2 import Pc2Reader
 from ...sim.errors import InputError
+from ...sim.folder_lock import is_locked
 from ...sim.scene.folder import Scene
 from ..paths import for_blender
 

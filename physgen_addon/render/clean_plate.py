@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim.composite import backdrop, disocclusion, srgb
+from ...sim import srgb
+from ...sim.composite import backdrop, disocclusion
 from ...sim.composite.backdrop import Backdrop, Proxy, Warp, borders_of, make_proxy
 from ...sim.composite.compositing import SOFT, ObjectLayer, behind, shadow_exponents, shows_shadow
 from ...sim.composite.outpaint import Borders, inpaint_hole, outpaint
-from ...sim.composite.srgb import Linear
 from ...sim.errors import InputError
 from ...sim.scene.camera_path import (
     USUAL_ANGLE_DEG,
@@ -31,6 +31,7 @@ from ...sim.scene.camera_path import (
 )
 from ...sim.scene.folder import Scene
 from ...sim.scene.model import Camera
+from ...sim.srgb import Linear
 from ...sim.validation import to_json
 from ..frames.frame_files import read_layers
 from .render_options import RenderOptions

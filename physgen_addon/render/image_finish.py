@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ...sim.composite import blur, film_grain
 from ...sim.composite.compositing import ObjectLayer, rolled_off
 from ...sim.composite.pull_push import spread_values
-from ...sim.composite.srgb import Linear
 from ...sim.scene.equirectangular import LUMINANCE
 from ...sim.scene.model import Camera, SceneModel
 from ...sim.smoothstep import smoothstep
+from ...sim.srgb import Linear
 from .clean_plate import CleanPlate
 from .motion_blur import Vertices
 from .render_options import RenderOptions

@@ -20,9 +20,9 @@ from ...sim.composite import floor_reflection
 from ...sim.composite.compositing import ObjectLayer
 from ...sim.composite.pull_push import spread_values
 from ...sim.composite.reference_light import SurfaceGraph
-from ...sim.composite.srgb import Linear
 from ...sim.errors import RenderError
 from ...sim.scene.model import Camera, SceneModel
+from ...sim.srgb import Linear
 from ..scene_io.photo_view import add_camera, aim_camera
 from . import render_engines
 from .motion_blur import Moment

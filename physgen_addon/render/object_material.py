@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim.composite.highlights import CELLS, HEADROOM, Highlights, find_highlights
-from ...sim.composite.srgb import srgb_to_linear
 from ...sim.mpm.geometry.triangles import area_normals
 from ...sim.reconstruct.mesh_raster import Paint, colours, visible_pixels
 from ...sim.scene.meshes import ObjectMesh
 from ...sim.scene.model import Camera
+from ...sim.srgb import srgb_to_linear
 from .. import compat
 
 REST_LIGHT = "rest_light"

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...sim.cache.torn_skin_file import TornSkin, read_torn_skin
-from ...sim.composite.srgb import srgb_to_linear
 from ...sim.grains import CloudState, GrainCloud, ShownGrains, grain_size
 from ...sim.scene.model import Camera, Ground
+from ...sim.srgb import srgb_to_linear
 from ..playback import particles, point_caches
 from ..playback.bake_record import spacing
 from ..playback.geometry_nodes import Tree, set_input

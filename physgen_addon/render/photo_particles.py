@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...sim.cache.pc2 import Pc2Reader
-from ...sim.composite.srgb import srgb_to_linear
 from ...sim.scene.folder import Scene
 from ...sim.scene.meshes import load_object_mesh
 from ...sim.skinning import TORN_STRETCH, first_torn
+from ...sim.srgb import srgb_to_linear
 from ..playback import particles, point_caches
 from ..playback.bake_record import spacing
 from ..playback.geometry_nodes import Tree, set_input

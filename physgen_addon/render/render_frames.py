@@ -19,10 +19,10 @@ from ...sim.app.clip_check import Clip, clip_notices
 from ...sim.atomic import recover, replacing
 from ...sim.cache.bake_check import require_intact, unchanged_bake
 from ...sim.cache.bake_folder import Bake
-from ...sim.cache.folder_lock import folder_lock
 from ...sim.composite.compositing import FrameLayers
 from ...sim.errors import Cancelled, InputError, RenderError
 from ...sim.events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ...sim.folder_lock import folder_lock
 from ...sim.scene.folder import Scene, file_hash, require_photo
 from ...sim.scene.meshes import load_object_mesh
 from ...sim.scene.model import Camera

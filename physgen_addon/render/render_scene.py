@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ...sim.atomic import scratch_prefix
-from ...sim.composite.srgb import read_rgb
 from ...sim.plane_axes import plane_axes
 from ...sim.scene.folder import Scene, require_photo
 from ...sim.scene.meshes import ObjectMesh, load_object_mesh, read_mesh
 from ...sim.scene.model import Camera, Ground, SceneObject
 from ...sim.scene.shading import factors_at, read_shading
+from ...sim.srgb import read_rgb
 from .. import compat
 from ..playback import point_caches
 from ..scene_io.photo_view import add_camera, aim_camera, photo_uv, render_size

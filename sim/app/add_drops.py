@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
+from ..folder_lock import lock_beside
 from ..scene.folder import Scene
 from ..scene.material import load_preset
 from ..scene.meshes import read_mesh

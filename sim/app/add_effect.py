@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..atomic import scratch_prefix
-from ..cache.folder_lock import lock_beside
 from ..effects.registry import effect
 from ..errors import Cancelled, InputError
 from ..events import Event, IsCancelled, OnEvent, ignore, never
+from ..folder_lock import lock_beside
 from ..scene.folder import Scene, load_scene
 from ..scene.model import Effect, SceneModel
 from .scene_variant import save_variant

@@ -21,10 +21,10 @@ from ..cache.bake_folder import (
     remove_leftovers,
     remove_listed,
 )
-from ..cache.folder_lock import folder_lock
 from ..cache.pc2 import Pc2Reader
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ..folder_lock import folder_lock
 from ..scene.folder import Scene, inside
 from ..scene.meshes import ObjectMesh, load_object_mesh
 from ..scene.scene_output import changed_files

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from ..atomic import replacing
 from ..cache.bake_check import damage_of, require_intact
 from ..cache.bake_folder import CHECKPOINT_FILE, METRICS_FILE, Bake, BakeManifest, load_manifest
-from ..cache.checksums import Checksum, RunningSums, file_sum, span_for
 from ..cache.pc2 import Pc2Reader, Pc2Writer
+from ..checksums import Checksum, RunningSums, file_sum, span_for
 from ..errors import InputError, PhysGenError
 from ..files import is_file
 from ..npz import read_npz

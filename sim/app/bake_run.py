@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..atomic import write_json
 from ..cache.bake_folder import METRICS_FILE, TIMES_FILE, BakeManifest, remove_matter, save_manifest
-from ..cache.checksums import Checksum, span_for
 from ..cache.pc2 import Pc2Writer
+from ..checksums import Checksum, span_for
 from ..errors import Cancelled, PhysGenError, SimulationError
 from ..events import IsCancelled, StageProgress
 from .bake_resume import BakeSums, Checkpoint, Mendable, OtherSamples, State, drop_checkpoint, save_checkpoint

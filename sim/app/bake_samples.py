@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing
 from ..cache.bake_folder import GRAINS, MATTER_FILES, MESH_SPACE, SURFACE, BakedObject, BakeManifest
-from ..cache.checksums import Checksum, file_sum, span_for
 from ..cache.pc2 import Pc2Reader, Pc2Writer
 from ..cache.torn_skin_file import write_torn_skin
+from ..checksums import Checksum, file_sum, span_for
 from ..constitutive import FLUID, SHAPED, RigidMaterial
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled

@@ -24,9 +24,9 @@ from queue import Empty, SimpleQueue
 from typing import Any, TextIO
 
 from ..atomic import remove_unfinished
-from ..cache.folder_lock import release_all
 from ..errors import OUT_OF_MEMORY, Cancelled, InputError, PhysGenError
 from ..events import Event, IsCancelled, OnEvent
+from ..folder_lock import release_all
 from ..memory import ran_out, resident_memory
 from ..scene.folder import load_scene
 from ..validation import parse, read_json, to_json

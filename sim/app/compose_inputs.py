@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..composite.image_metrics import psnr, ssim
-from ..composite.srgb import read_mask, read_rgb
 from ..errors import InputError
 from ..gaussians.compose.composition_parts import Reference
 from ..gaussians.guidance.ideal_denoiser import IdealDenoiser
@@ -33,6 +32,7 @@ from ..mpm.geometry.triangles import check_closed, face_normals, validated
 from ..scene.folder import Scene
 from ..scene.model import Camera, Ground, SceneObject
 from ..scene.textured_mesh import TexturedMesh, read_textured_mesh, transformed
+from ..srgb import read_mask, read_rgb
 
 Array = NDArray[np.float64]
 

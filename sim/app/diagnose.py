@@ -6,7 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..atomic import replacing_tree
-from ..cache.folder_lock import lock_beside
 from ..diagnose import run_diagnosis
 from ..diagnose.capture import Capture
 from ..diagnose.diagnosis import REPORT_FILE, Diagnosis, write_diagnosis
@@ -14,6 +13,7 @@ from ..diagnose.report import write_report
 from ..diagnose.run_diagnosis import DiagnoseOptions
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..folder_lock import lock_beside
 
 
 def diagnose(

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_bytes
 from ..cache.bake_folder import MANIFEST_FILE, Bake, load_bake
-from ..cache.folder_lock import lock_beside
-from ..composite.srgb import read_rgb
 from ..errors import Cancelled, InputError
 from ..evaluate.bake_physics import bake_physics
 from ..evaluate.evaluation import HIGHER, JSON_FILE, NEITHER, Evaluation, Measure, Section, table, write_evaluation
@@ -42,8 +40,10 @@ from ..evaluate.physics_iq_folder import (
 from ..evaluate.report import strip_frames, write_page
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file
+from ..folder_lock import lock_beside
 from ..reconstruct.reasoning.chat_client import ChatRequest
 from ..scene.folder import SCENE_FILE, Scene, load_scene
+from ..srgb import read_rgb
 from ..validation import quantity, require_quantities
 
 STILL = "the first frame repeated"

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_json
-from ..cache.folder_lock import lock_beside
 from ..composite.side_by_side import (
     BoxPose,
     box_faces,
@@ -33,6 +32,7 @@ from ..diagnose.run_diagnosis import REFITTED, DiagnoseOptions
 from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
+from ..folder_lock import lock_beside
 from ..rigid_alignment import nearest_pose
 
 if TYPE_CHECKING:

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from ..atomic import replacing, write_bytes
 from ..cache.bake_check import unchanged_bake
 from ..cache.bake_folder import Bake, BakedObject
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, never
 from ..files import is_file, shown
+from ..folder_lock import lock_beside
 from ..memory import ran_out
 from ..mpm.scene_contacts import surface
 from ..mpm.surface_contact import SurfaceContact

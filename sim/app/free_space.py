@@ -201,7 +201,7 @@ class PlateColours:
             return
         import cv2
 
-        from ..composite.srgb import cielab, read_rgb
+        from ..srgb import cielab, read_rgb
 
         image = read_rgb(scene.file(scene.model.background))
         scale = min(1.0, self.SIDE / max(image.shape[:2]))

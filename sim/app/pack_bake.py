@@ -13,13 +13,13 @@ from typing import Any
 from ..atomic import replacing_tree, write_json
 from ..cache.bake_check import require_intact, unchanged_bake
 from ..cache.bake_folder import METRICS_FILE, Bake, BakeManifest, load_bake, save_manifest
-from ..cache.checksums import Checksum, file_sum, span_for
-from ..cache.folder_lock import lock_beside
 from ..cache.packed_cache import PackedCache, pack_cache
 from ..cache.pc2 import Pc2Reader, Pc2Writer
+from ..checksums import Checksum, file_sum, span_for
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, never
 from ..files import is_file
+from ..folder_lock import lock_beside
 from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 

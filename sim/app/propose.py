@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..atomic import write_bytes, write_json
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..folder_lock import lock_beside
 from ..reconstruct.reconstruct_options import WITHOUT, Proposal
 from ..scene.folder import file_hash
 from ..trust import trusted_spec

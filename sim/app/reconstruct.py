@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..atomic import recover, write_json
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..events import IsCancelled, OnEvent, ignore, never
+from ..folder_lock import lock_beside
 from ..memory import freed_memory_kept
 from ..reconstruct import ObjectRequest, ReconstructOptions
 from ..reconstruct.adapters.adapter_registry import chosen_segmenter, spec_files

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..atomic import replacing
-from ..cache.folder_lock import LOCK_FILE, folder_lock, lock_beside
 from ..effects.registry import effect
 from ..errors import InputError
+from ..folder_lock import LOCK_FILE, folder_lock, lock_beside
 from ..scene.folder import (
     SCENE_FILE,
     Scene,

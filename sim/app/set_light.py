@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..atomic import replacing
-from ..cache.folder_lock import lock_beside
-from ..composite.srgb import read_mask, read_rgb
 from ..errors import InputError
 from ..events import OnEvent, ignore
+from ..folder_lock import lock_beside
 from ..reconstruct.background.unboxed_things import unboxed_things
 from ..reconstruct.lighting.light_estimate import LitScene, describe_sun, estimate_light, light_with_sun
 from ..reconstruct.shape.inflate import inflate
@@ -28,6 +27,7 @@ from ..scene.folder import Scene, load_scene, require_photo, save_scene
 from ..scene.meshes import load_object_mesh
 from ..scene.model import Ground, Light, Vector
 from ..scene.scene_output import STAMP_FILE
+from ..srgb import read_mask, read_rgb
 
 LIGHT_FOLDER = "light"
 

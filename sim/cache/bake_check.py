@@ -8,11 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
-from ..files import open_file, same_file
-from ..scene.folder import inside
-from .bake_folder import METRICS_FILE, Bake, BakeManifest, load_manifest
-from .checksums import (
+from ..checksums import (
     DAMAGED,
     MISSING,
     OK,
@@ -24,6 +20,10 @@ from .checksums import (
     file_sum,
     ranges_text,
 )
+from ..errors import InputError
+from ..files import open_file, same_file
+from ..scene.folder import inside
+from .bake_folder import METRICS_FILE, Bake, BakeManifest, load_manifest
 from .pc2 import HEADER_BYTES, MAX_CACHE_BYTES, header
 
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_json
+from ..checksums import Checksum
 from ..errors import InputError
+from ..folder_lock import folder_lock
 from ..processes import is_running
 from ..scene.folder import inside
 from ..validation import parse, read_json, to_json
 from ..version import VERSION
-from .checksums import Checksum
-from .folder_lock import folder_lock
 from .pc2 import MAX_VERTICES, Pc2Reader
 
 MANIFEST_FORMAT = "physgen-bake/1"

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import naming
+from ..checksums import Checksum, RunningSums, sync
 from ..errors import InputError
 from ..files import open_file
-from .checksums import Checksum, RunningSums, sync
 
 _HEADER = struct.Struct("<12siiffi")
 _SIGNATURE = b"POINTCACHE2\0"

@@ -2,7 +2,6 @@
 """Image formation without Blender: rendered layers and the photo become one frame (docs/rendering.md).
 
 compositing.py         a frame from its layers
-srgb.py                the transfer function, image files, resampling
 reference_light.py     light on objects that stand where the photo shows them; pull_push.py what it hides
 disocclusion.py        pixels of the photo that stay valid as an object moves
 floor_reflection.py    reflections in the floor; highlights.py on things

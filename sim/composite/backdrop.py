@@ -23,9 +23,9 @@ from scipy import ndimage
 from ..scene.camera_path import level_forward
 from ..scene.model import Camera, Ground
 from ..smoothstep import smoothstep
+from ..srgb import Linear
 from .disocclusion import push_pull
 from .outpaint import Borders, needed_borders, pixel_grid, resample
-from .srgb import Linear
 
 FloatArray = NDArray[np.float64]
 

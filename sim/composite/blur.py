@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.model import Camera
+from ..srgb import Linear
 from .compositing import ObjectLayer
-from .srgb import Linear
 
 Image = NDArray[np.float32]
 LEAST_PX = 0.25

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.equirectangular import LUMINANCE
+from ..srgb import Linear
 from .pull_push import fill_gaps
-from .srgb import Linear
 
 MAX_RATIO = 8.0
 """Largest ratio of light now to light at rest; beyond three stops it is division by noise."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..smoothstep import smoothstep
-from .srgb import Linear
+from ..srgb import Linear
 
 FADE_START = 0.004
 FADE_END = 0.08

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..robust_deviation import MEDIAN_TO_DEVIATION
-from .srgb import Linear, linear_to_srgb, srgb_to_linear
+from ..srgb import Linear, linear_to_srgb, srgb_to_linear
 
 SIGMAS = (0.8, 1.6, 3.2)
 """Blur standard deviations in pixels whose differences are the octaves."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.model import Camera, Ground, Matrix4
+from ..srgb import Linear
 from .blur import gaussian_blur, varying_blur
-from .srgb import Linear
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

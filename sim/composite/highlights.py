@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..smoothstep import smoothstep
+from ..srgb import bytes_to_linear, linear_to_bytes
 from .pull_push import fill_gaps
-from .srgb import bytes_to_linear, linear_to_bytes
 
 CELLS = 32
 """Cells along a side of the map over the normals that face the camera."""

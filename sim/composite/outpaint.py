@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import srgb
 from ..errors import InputError
 from ..smoothstep import smoothstep
-from . import srgb
 from .inpaint import FillOptions, inpaint
 
 MAX_SHARE = 0.35

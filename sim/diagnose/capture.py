@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing, write_json
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
+from ..folder_lock import lock_beside
 from ..npz import read_npz
 from ..scene.folder import inside
 from ..scene.meshes import read_mesh

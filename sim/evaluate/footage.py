@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..composite.srgb import read_rgb
 from ..diagnose.track.video_file import MAX_SIDE, Video, VideoInfo
 from ..errors import InputError
 from ..files import shown
+from ..srgb import read_rgb
 from ..validation import require_range
 
 Frame = NDArray[np.uint8]

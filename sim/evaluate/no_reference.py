@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..composite.image_metrics import psnr, ssim_map
-from ..composite.srgb import read_rgb
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled
+from ..srgb import read_rgb
 from .evaluation import HIGHER, LOWER, NEITHER, Curve, Measure, Section
 from .flow import FlowEstimator, between
 from .footage import Footage, Frame, reduced

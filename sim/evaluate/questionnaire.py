@@ -21,14 +21,14 @@ from typing import Any
 from PIL import Image
 
 from ..atomic import replacing_tree, write_bytes, write_json
-from ..cache.folder_lock import lock_beside
-from ..composite.srgb import read_rgb
 from ..diagnose.track.video_file import Video
 from ..errors import Cancelled, InputError
 from ..events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..files import is_file, open_file, read_toml, shown
+from ..folder_lock import lock_beside
 from ..html import Markup, page_head, render
 from ..page_style import FONT, PALETTES
+from ..srgb import read_rgb
 from ..validation import quantity, read_json, require_quantities
 from ..version import VERSION
 from .judge_question import CRITERIA, MAX_PROMPT, MOST_VIDEOS, TITLES

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import replacing_tree, write_bytes, write_json
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..files import shown, without_folder
+from ..folder_lock import lock_beside
 from ..validation import finite_or_none, quantity, read_json, require_quantities
 from ..version import VERSION
 from .evaluation import no_formula

@@ -20,7 +20,6 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from ..composite.srgb import srgb_to_linear
 from ..errors import InputError
 from ..events import OnEvent, ignore
 from ..gaussians.splat_ply import read_splat_file, write_splats
@@ -28,6 +27,7 @@ from ..gaussians.splats import Splats
 from ..scene.folder import Scene, load_scene, save_scene
 from ..scene.model import Camera, Matrix4, SceneModel, SceneObject
 from ..scene.scene_output import replacing_folder
+from ..srgb import srgb_to_linear
 from ..validation import valid_names
 from . import DEFAULT_UP_AXIS, SPLAT_UP_AXES
 

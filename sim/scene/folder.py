@@ -15,9 +15,9 @@ from typing import Any
 from urllib.parse import unquote
 
 from ..atomic import recover, write_json
-from ..cache.folder_lock import lock_beside
 from ..errors import InputError
 from ..files import MOST_HASHED, is_file, open_file, read_bytes, same_file, shown
+from ..folder_lock import lock_beside
 from ..validation import MAX_JSON_BYTES, parse, read_json, to_json
 from .model import FORMAT, Ground, SceneModel
 from .scene_object import SceneObject

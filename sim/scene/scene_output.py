@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..atomic import recover, replacing_tree, write_json
-from ..cache.checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState, file_sum
-from ..cache.folder_lock import lock_beside
+from ..checksums import DAMAGED, MISSING, OK, UNKNOWN, FileState, file_sum
 from ..errors import InputError
 from ..files import is_file
+from ..folder_lock import lock_beside
 from ..validation import read_json
 from .folder import SCENE_FILE, Scene, inside
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..composite.srgb import bytes_to_linear, linear_to_bytes, read_rgb
 from ..errors import InputError
 from ..files import PICTURE_FORMATS
+from ..srgb import bytes_to_linear, linear_to_bytes, read_rgb
 from .folder import Scene
 from .scene_object import SceneObject
 from .textured_mesh import TexturedMesh, read_textured_mesh

@@ -19,9 +19,9 @@ import pytest
 import trimesh
 from physgen.sim.cache.bake_folder import BakedObject, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.model import Camera, Ground, Light, SceneModel, SceneObject
+from physgen.sim.srgb import linear_to_bytes
 from PIL import Image
 
 from ..conftest import complete_manifest
@@ -286,7 +286,7 @@ def bake(world, tmp_path):
 
 @contextlib.contextmanager
 def _held_elsewhere(folder: Path) -> Iterator[None]:
-    code = "import pathlib, sys; from physgen.sim.cache.folder_lock import folder_lock\n"
+    code = "import pathlib, sys; from physgen.sim.folder_lock import folder_lock\n"
     code += "with folder_lock(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     command = [sys.executable, "-c", code, str(folder)]
     holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

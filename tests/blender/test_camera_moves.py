@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
 from physgen.sim.scene.camera_path import CameraOffset, offset_camera
+from physgen.sim.srgb import read_rgb
 from scipy import ndimage
 
 bpy = pytest.importorskip("bpy")

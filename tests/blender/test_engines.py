@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import linear_to_bytes, read_mask
 from physgen.sim.errors import InputError, RenderError
+from physgen.sim.srgb import linear_to_bytes, read_mask
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.playback.point_caches import open_bake

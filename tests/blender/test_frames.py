@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import load_bake
-from physgen.sim.composite.srgb import bytes_to_linear, read_rgb
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.srgb import bytes_to_linear, read_rgb
 
 bpy = pytest.importorskip("bpy")
 import cv2

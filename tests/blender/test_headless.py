@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import MANIFEST_FILE, load_bake
-from physgen.sim.cache.folder_lock import folder_lock
-from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
+from physgen.sim.folder_lock import folder_lock
 from physgen.sim.scene.folder import load_scene
+from physgen.sim.srgb import read_rgb
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.render.render_frames import render_frames

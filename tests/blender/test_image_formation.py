@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from physgen.sim.cache.bake_folder import load_bake
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
 from physgen.sim.scene.model import Light
 from physgen.sim.scene.shading import NEUTRAL, shading_values
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes, read_mask, read_rgb
 from PIL import Image
 
 bpy = pytest.importorskip("bpy")

@@ -10,8 +10,8 @@ from physgen.physgen_addon.render import look_nodes
 from physgen.physgen_addon.render.render_options import FrameFormat
 from physgen.physgen_addon.render.renderer import DataLayers
 from physgen.sim.composite.compositing import FrameLayers, ObjectLayer, compose
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.errors import InputError
+from physgen.sim.srgb import linear_to_bytes
 
 pytestmark = [
     pytest.mark.skipif(not look_nodes.available(), reason="compositor node groups are Blender 5.0's"),

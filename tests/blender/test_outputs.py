@@ -12,8 +12,8 @@ import OpenImageIO as oiio
 import pytest
 from physgen.sim.cache.bake_folder import load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
-from physgen.sim.composite.srgb import linear_to_bytes, read_rgb
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.srgb import linear_to_bytes, read_rgb
 
 bpy = pytest.importorskip("bpy")
 import cv2

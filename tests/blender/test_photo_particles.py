@@ -8,8 +8,8 @@ import pytest
 from physgen.sim.cache.bake_folder import load_bake, load_manifest, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import read_mask, read_rgb
 from physgen.sim.scene.meshes import load_object_mesh
+from physgen.sim.srgb import read_mask, read_rgb
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.render.render_frames import render_frames

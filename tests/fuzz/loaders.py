@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import trimesh
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, save_manifest
-from physgen.sim.cache.checksums import span_for
 from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.checksums import span_for
 from physgen.sim.scene.folder import Scene, save_scene
 from physgen.sim.scene.material import load_preset
 from physgen.sim.scene.model import Camera, Effect, SceneModel, SceneObject

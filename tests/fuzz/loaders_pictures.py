@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 from loaders import BOX, MASK, PIXELS, RANDOM, add, put_json, put_picture
 from physgen.physgen_addon.frames.frame_files import Part, write_exr
-from physgen.sim.composite.srgb import read_mask as read_scene_mask
-from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.diagnose.track.video_file import Video
 from physgen.sim.gaussians.views.view_files import read_views
 from physgen.sim.importers.coco_masks import masks_from_json
@@ -22,6 +20,8 @@ from physgen.sim.reconstruct.camera.depth_map import read_depth
 from physgen.sim.reconstruct.photo import load_photo
 from physgen.sim.reconstruct.segmentation.object_masks import read_mask
 from physgen.sim.scene.environment import read_environment
+from physgen.sim.srgb import read_mask as read_scene_mask
+from physgen.sim.srgb import read_rgb
 from PIL import Image
 
 PICTURES = (".png", ".jpg", ".webp", ".tif", ".bmp", ".exr", ".hdr")

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.reconstruct.appearance.albedo import compute_albedo, division_exponent
 from physgen.sim.reconstruct.appearance.appearance_estimate import estimate_appearance
 from physgen.sim.reconstruct.camera import ground_camera as cameras
@@ -18,6 +17,7 @@ from physgen.sim.reconstruct.reasoning.material_names import shipped_names
 from physgen.sim.reconstruct.reconstruct_options import ObjectRequest
 from physgen.sim.reconstruct.shape.body_texture import TexturedSurface, crop_texture
 from physgen.sim.scene.model import Light
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 
 RADIUS, MIDDLE = 0.3, np.array([0.0, 1.6, 0.3])
 GROUND = 0.4

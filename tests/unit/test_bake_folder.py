@@ -18,9 +18,9 @@ from physgen.sim.cache.bake_folder import (
     remove_leftovers,
     save_manifest,
 )
-from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
+from physgen.sim.folder_lock import folder_lock
 
 from ..conftest import complete_manifest
 
@@ -132,7 +132,7 @@ def test_a_bake_that_runs_is_not_freed(tmp_path):
     code = textwrap.dedent(f"""
         import sys
         from pathlib import Path
-        from physgen.sim.cache.folder_lock import folder_lock
+        from physgen.sim.folder_lock import folder_lock
         with folder_lock(Path({str(bake)!r})):
             print("held", flush=True)
             sys.stdin.read()

@@ -29,8 +29,8 @@ from physgen.sim.cache.bake_folder import (
     load_manifest,
     save_manifest,
 )
-from physgen.sim.cache.checksums import Checksum, RunningSums, damaged_samples, ranges_text, span_for
 from physgen.sim.cache.pc2 import HEADER_BYTES, Pc2Reader, Pc2Writer
+from physgen.sim.checksums import Checksum, RunningSums, damaged_samples, ranges_text, span_for
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.scene_output import SUMS_FILE, changed_files, check_scene, replacing_folder

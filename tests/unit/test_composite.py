@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.composite import compositing, disocclusion, srgb
+from physgen.sim import srgb
+from physgen.sim.composite import compositing, disocclusion
 from physgen.sim.composite.image_metrics import psnr
 from physgen.sim.errors import InputError
 

@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.composite.srgb import read_rgb
 from physgen.sim.errors import InputError
 from physgen.sim.evaluate import physics_iq
 from physgen.sim.evaluate.footage import at_rate, open_footage
@@ -28,6 +27,7 @@ from physgen.sim.evaluate.physics_iq import (
     verified_scores,
     weighted_overlap,
 )
+from physgen.sim.srgb import read_rgb
 
 SIZE = (160, 120)
 

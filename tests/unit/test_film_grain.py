@@ -4,7 +4,8 @@
 import cv2
 import numpy as np
 import pytest
-from physgen.sim.composite import film_grain, srgb
+from physgen.sim import srgb
+from physgen.sim.composite import film_grain
 
 HEIGHT, WIDTH = 240, 320
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from physgen.sim.composite.compositing import ObjectLayer, behind, compose, matted, soft_reach
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.events import ignore, never
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.mesh_raster import visible_pixels
@@ -17,6 +16,7 @@ from physgen.sim.reconstruct.reconstruct_options import ObjectRequest, Reconstru
 from physgen.sim.reconstruct.shape.object_bodies import make_bodies
 from physgen.sim.reconstruct.shape.primitives import Box, Sphere, SurfaceOfRevolution, rasterize
 from physgen.sim.reconstruct.stage_cache import StageCache, Steps
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 
 WIDTH, HEIGHT = 480, 360
 VIEW = camera_above_ground(WIDTH, HEIGHT, 520.0, math.radians(14.0))

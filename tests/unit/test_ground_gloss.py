@@ -12,7 +12,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from physgen.sim.composite import floor_reflection
 from physgen.sim.composite.image_metrics import psnr
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.events import never
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 from physgen.sim.reconstruct.lighting.ground_gloss import _Comparison, _Kept, estimate_gloss
@@ -23,6 +22,7 @@ from physgen.sim.reconstruct.reconstruct_options import ReconstructOptions
 from physgen.sim.reconstruct.shape.body_texture import TexturedSurface
 from physgen.sim.reconstruct.stage_cache import StageCache, Steps
 from physgen.sim.scene.model import Ground
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 
 WIDTH, HEIGHT = 240, 180
 VIEW = camera_above_ground(WIDTH, HEIGHT, 260.0, math.radians(20.0))

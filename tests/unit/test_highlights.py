@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from physgen.sim.composite.highlights import CELLS, HEADROOM, find_highlights
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 
 COLOUR = np.array([0.55, 0.2, 0.04])
 SIDE = 120

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.composite.srgb import bytes_to_linear
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 from physgen.sim.reconstruct.lighting.ground_lighting import MAX_SHARE
 from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps, ground_axes
@@ -14,6 +13,7 @@ from physgen.sim.reconstruct.lighting.light_estimate import KEY_SHARE, KEY_SPREA
 from physgen.sim.reconstruct.lighting.standing_surface import ground_before, standing_surface
 from physgen.sim.scene.environment import ground_light, lamps_in
 from physgen.sim.scene.model import Ground
+from physgen.sim.srgb import bytes_to_linear
 
 WIDTH, HEIGHT, RADIUS = 320, 240, 0.13
 CAMERA = camera_above_ground(WIDTH, HEIGHT, 300.0, math.radians(40.0))

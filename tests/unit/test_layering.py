@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,18 @@ def test_sim_needs_no_blender_and_never_looks_upward(path):
 def test_nothing_below_the_use_cases_imports_them():
     below = [path for path in sources("sim") if "app" not in path.relative_to(ROOT).parts]
     assert not [path for path in below if any(name.startswith("sim.app") for name in imports(path))]
+
+
+def test_no_two_parts_of_sim_import_each_other():
+    """Folders and files, directly or through others: in some order each needs only those before it."""
+    needs = {}
+    for path in sources("sim"):
+        part = path.relative_to(ROOT / "sim").parts[0].removesuffix(".py")
+        names = (name.split(".") for name in imports(path))
+        needs.setdefault(part, set()).update(name[1] for name in names if name[0] == "sim" and len(name) > 1)
+        needs[part].discard(part)
+    order = list(TopologicalSorter(needs).static_order())  # Raises CycleError with the parts in a circle.
+    assert order.index("scene") < min(order.index(part) for part in ("cache", "composite", "app"))
 
 
 @pytest.mark.parametrize("path", sources("physgen_addon"), ids=lambda p: str(p.relative_to(ROOT)))

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from physgen.batch.cli import main
 from physgen.sim import atomic, files, processes
-from physgen.sim.cache.folder_lock import lock_beside
 from physgen.sim.errors import InputError
+from physgen.sim.folder_lock import lock_beside
 from physgen.sim.processes import Mark, own_mark, parse_mark
 from physgen.sim.scene.folder import load_scene
 
@@ -222,7 +222,7 @@ def test_of_two_reconstructs_into_one_folder_the_second_is_refused_by_name(tmp_p
     root = ball_scene().root
     code = f"""
 from pathlib import Path
-from physgen.sim.cache.folder_lock import lock_beside
+from physgen.sim.folder_lock import lock_beside
 with lock_beside(Path({str(root)!r})):
     print("held", flush=True)
     input()

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.composite.srgb import linear_to_bytes, srgb_to_linear
 from physgen.sim.reconstruct.segmentation import matting
 from physgen.sim.reconstruct.segmentation.matting import (
     Trimap,
@@ -15,6 +14,7 @@ from physgen.sim.reconstruct.segmentation.matting import (
     refine_alpha,
     soft_alpha,
 )
+from physgen.sim.srgb import linear_to_bytes, srgb_to_linear
 from scipy import ndimage
 
 HEIGHT, WIDTH = 120, 160

@@ -16,8 +16,8 @@ from physgen.physgen_addon.frames.contact_sheet import played, write_contact_she
 from physgen.physgen_addon.frames.frame_files import Part, encoded, read_layers, read_picture, write_exr, write_png
 from physgen.physgen_addon.frames.frame_index import FrameIndex, gather_frames
 from physgen.physgen_addon.render.render_options import FrameFormat
-from physgen.sim.composite.srgb import bytes_to_linear
 from physgen.sim.errors import InputError
+from physgen.sim.srgb import bytes_to_linear
 from PIL import Image
 
 PIXELS = np.random.default_rng(3).integers(0, 256, (12, 20, 3), dtype=np.uint8)

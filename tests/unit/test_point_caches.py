@@ -15,11 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from physgen.sim.cache import folder_lock as folder_lock_module
+from physgen.sim import folder_lock as folder_lock_module
 from physgen.sim.cache.bake_folder import BakedObject, load_manifest, save_manifest
-from physgen.sim.cache.folder_lock import LOCK_FILE, MOST_BYTES, folder_lock, is_held, is_locked
 from physgen.sim.cache.pc2 import Pc2Reader, Pc2Writer
 from physgen.sim.errors import InputError
+from physgen.sim.folder_lock import LOCK_FILE, MOST_BYTES, folder_lock, is_held, is_locked
 
 from ..conftest import complete_manifest
 
@@ -121,7 +121,7 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from physgen.sim.cache.folder_lock import folder_lock
+from physgen.sim.folder_lock import folder_lock
 with folder_lock(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -239,7 +239,7 @@ def test_of_many_that_find_a_dead_lock_one_holds_the_folder_at_a_time(tmp_path):
     code = """
 import sys, time
 from pathlib import Path
-from physgen.sim.cache.folder_lock import folder_lock
+from physgen.sim.folder_lock import folder_lock
 from physgen.sim.errors import InputError
 folder = Path(sys.argv[1])
 for _ in range(40):

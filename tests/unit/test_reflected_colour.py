@@ -4,10 +4,10 @@
 import cv2
 import numpy as np
 import pytest
-from physgen.sim.composite.srgb import linear_to_srgb
 from physgen.sim.reconstruct.segmentation.box_crop import crop_around_box
 from physgen.sim.reconstruct.segmentation.box_segmentation import segment
 from physgen.sim.reconstruct.segmentation.reflected_colour import tinted_ground
+from physgen.sim.srgb import linear_to_srgb
 
 SHAPE = (220, 260)
 BOX = (60, 22, 210, 180)

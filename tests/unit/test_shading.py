@@ -7,7 +7,6 @@ import io
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.composite.srgb import bytes_to_linear, linear_to_bytes
 from physgen.sim.errors import InputError
 from physgen.sim.reconstruct import turntable
 from physgen.sim.scene.folder import load_scene, save_scene
@@ -22,6 +21,7 @@ from physgen.sim.scene.shading import (
     shading_factors,
     shading_values,
 )
+from physgen.sim.srgb import bytes_to_linear, linear_to_bytes
 from PIL import Image
 
 LIGHT = np.linspace(-1.2, 1.2, 64)

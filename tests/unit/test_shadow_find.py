@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.lighting.ground_lighting import overcast_sky, sun_disc
 from physgen.sim.reconstruct.lighting.shadow_masks import cast_shadows, threshold_shadows
+from physgen.sim.srgb import linear_to_bytes
 from scipy import ndimage
 
 WIDTH, HEIGHT = 240, 180

@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from physgen.sim.composite.srgb import linear_to_bytes
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground
 from physgen.sim.reconstruct.lighting.ground_pixels import ground_pixels, proxy_body
 from physgen.sim.reconstruct.lighting.shadow_masks import PENUMBRA_DILATION, cast_shadows, object_holes
 from physgen.sim.reconstruct.lighting.shadow_model import LEVELS, dark_rim, darkening_sums
+from physgen.sim.srgb import linear_to_bytes
 from PIL import Image
 from scipy import ndimage
 

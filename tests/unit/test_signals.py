@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 from physgen.sim.cache.bake_folder import BakedObject, save_manifest
-from physgen.sim.cache.checksums import span_for
 from physgen.sim.cache.pc2 import Pc2Writer
+from physgen.sim.checksums import span_for
 from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.processes import is_running
 from PIL import Image

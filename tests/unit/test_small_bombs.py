@@ -16,9 +16,9 @@ from physgen.batch.farm.planning.job_file import load_job
 from physgen.sim import atomic
 from physgen.sim.app.scene_bodies import colliders_of
 from physgen.sim.cache.bake_folder import BakedObject, free_bake, save_manifest
-from physgen.sim.cache.folder_lock import folder_lock
 from physgen.sim.diagnose.capture import load_capture
 from physgen.sim.errors import InputError
+from physgen.sim.folder_lock import folder_lock
 from physgen.sim.importers.coco_masks import masks_from_json
 from physgen.sim.importers.recordings import read_recording
 from physgen.sim.importers.rigid_models import read_rigid_model

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 from physgen.batch.terminal import Terminal
+from physgen.sim import folder_lock as locks
 from physgen.sim.atomic import final_path, replacing, replacing_tree
-from physgen.sim.cache import folder_lock as locks
 from physgen.sim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="shells and signals of POSIX")

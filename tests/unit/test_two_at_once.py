@@ -35,7 +35,7 @@ HOLDER = """
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from physgen.sim.cache.folder_lock import folder_lock, lock_beside
+from physgen.sim.folder_lock import folder_lock, lock_beside
 with ExitStack() as held:
     for name in sys.argv[1:]:
         held.enter_context(lock_beside(Path(name)))

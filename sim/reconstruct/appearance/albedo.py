@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...composite.srgb import linear_to_bytes
+from ...srgb import linear_to_bytes
 from ..creases import CreasedSurface
 from ..mesh_raster import rasterise
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.equirectangular import Radiance
 from ...scene.model import Camera, Light
+from ...srgb import bytes_to_linear
 from ..creases import CreasedSurface, split_creases
 from ..mesh_raster import seen_faces, visible_pixels
 from ..photo_layers import Layers

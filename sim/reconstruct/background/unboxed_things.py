@@ -17,9 +17,9 @@ from scipy import ndimage
 from skimage.morphology import h_maxima
 from skimage.segmentation import watershed
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.equirectangular import LUMINANCE
 from ...scene.model import Camera
+from ...srgb import bytes_to_linear
 from ..camera.ground_camera import on_ground
 from ..segmentation.alike_blocks import blocks_of_a_kind
 from ..segmentation.mask_geometry import grown

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...composite import floor_reflection
-from ...composite.srgb import bytes_to_linear, linear_to_bytes
 from ...scene.model import Camera, Ground
+from ...srgb import bytes_to_linear, linear_to_bytes
 from ..shape.body_texture import TexturedSurface
 from .ground_roughness import DARKEST, LEVEL, VARNISH, MirrorImage, fitted_roughness, mirror_image, open_ground
 

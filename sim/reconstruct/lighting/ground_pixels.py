@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.equirectangular import LUMINANCE
 from ...scene.model import Camera
+from ...srgb import bytes_to_linear
 from ..camera.ground_camera import on_ground
 from ..shape.inflate import roundness
 from .shadow_planes import ShadowPlane, ground_plane

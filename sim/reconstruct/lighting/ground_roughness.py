@@ -19,8 +19,8 @@ from scipy.optimize import minimize_scalar
 
 from ...composite import floor_reflection
 from ...composite.pull_push import spread_values
-from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera, Ground
+from ...srgb import bytes_to_linear
 from ..mesh_raster import Paint, colours, visible_pixels
 from ..shape.body_texture import TexturedSurface
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera, Ground, Vector
+from ...srgb import bytes_to_linear
 from .ground_lighting import (
     GroundLight,
     ShadowCaster,

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.environment import SPOT_SHARE, ground_light, sun_in
 from ...scene.equirectangular import LUMINANCE, Radiance, directions
 from ...scene.model import Camera, Ground, Light, Vector
+from ...srgb import bytes_to_linear
 from .lamps import MOST_LAMPS, LampEstimate, Mask, Mesh, estimate_lamps, ground_axes
 
 SIZE = (64, 32)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
+from ...srgb import bytes_to_linear
 from ..segmentation.mask_geometry import enclosed_holes
 from .ground_pixels import GroundPixels, ProxyBody, ground_pixels, proxy_body
 from .shadow_lamps import ShadowLamp, ShadowLight, direction_of, fit_light, fit_wall_light, light_shares

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
+from ...srgb import bytes_to_linear
 from ..background.surface_edges import Edge, edges_behind
 from ..background.surface_inpainting import logarithms
 from ..camera.ground_camera import depth_below, on_ground

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .mask_geometry import Mask, shrunk
 
 Box = tuple[int, int, int, int]

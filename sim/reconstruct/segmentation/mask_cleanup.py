@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from skimage.segmentation import watershed
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .box_crop import is_smoother
 from .mask_geometry import enclosed_holes, largest_component, shrunk, touching
 

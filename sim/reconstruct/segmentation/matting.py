@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ...composite.srgb import bytes_to_linear, cielab, linear_to_bytes
+from ...srgb import bytes_to_linear, cielab, linear_to_bytes
 from .box_crop import crop_around_box
 from .colour_models import LIMIT, graph_cut, ground_likelihood, learn, principal_contrast
 from .mask_geometry import grown, touching

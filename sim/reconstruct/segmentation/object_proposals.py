@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from skimage.segmentation import felzenszwalb, slic
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
 from .alike_blocks import alike_blocks

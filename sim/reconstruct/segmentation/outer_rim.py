@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .box_crop import edge_crest, edge_strength, small_copy
 from .mask_geometry import Mask, grown, touching
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .proposal_features import at_size_of, copy_of
 
 Mask = NDArray[np.bool_]

@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.segmentation import felzenszwalb
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .box_crop import BoxCrop, is_smoother
 from .mask_geometry import Mask, grown, ring_around, shrunk
 

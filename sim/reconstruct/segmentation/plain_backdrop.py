@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from ..reconstruct_options import Proposal
 from .box_crop import edge_strength
 from .mask_geometry import grown, touching

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .box_crop import edge_crest
 from .mask_geometry import Mask, extent_of, outline_of, ring_around, shrunk, solidity_of
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...composite.srgb import bytes_to_linear
 from ...robust_deviation import robust_deviation
 from ...scene.model import Camera
 from ...smoothstep import smoothstep
+from ...srgb import bytes_to_linear
 from ..mesh_raster import rasterise
 from .body_texture import CropTexture
 from .inflated_mesh import BodyMesh

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...composite.srgb import bytes_to_linear
 from ...scene.model import Camera
+from ...srgb import bytes_to_linear
 from ..segmentation.round_things import circles_of_a_kind
 
 Mask = NDArray[np.bool_]

@@ -22,7 +22,7 @@ from skimage.morphology import reconstruction
 
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...composite.pull_push import fill_gaps
-from ...composite.srgb import cielab
+from ...srgb import cielab
 from .stripes import beside_stripes, enclosed
 
 Mask = NDArray[np.bool_]

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ...composite.srgb import linear_to_srgb, srgb_to_linear
 from ...mpm.geometry.triangles import face_normals
 from ...scene.model import Camera
 from ...scene.shading import shading_values
 from ...smoothstep import smoothstep
+from ...srgb import linear_to_srgb, srgb_to_linear
 from ..mesh_raster import Number, rasterise
 from .body_texture import CropTexture, TexturedSurface, distance_behind, seen_vertices
 from .even_light import light_on

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from ..errors import InputError
-from ..files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
+from .errors import InputError
+from .files import MAX_PICTURE_BYTES, PICTURE_FORMATS, open_file
 
 Linear = NDArray[np.float32]
 """(H, W, 3) linear light, Rec. 709 primaries, 1 is the white of an 8-bit image."""

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..processes import UNKNOWN_START, Mark, own_mark, parse_mark
+from .errors import InputError
+from .processes import UNKNOWN_START, Mark, own_mark, parse_mark
 
 LOCK_FILE = ".lock"
 MOST_BYTES = 4096

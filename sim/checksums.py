@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checksums of a bake's files: written with it, and checked where they are read.
+"""Checksums of files: written with a bake or a scene, and checked where they are read.
 
 A cache has one for each range of samples, so that a frame is checked without reading the others. BLAKE2b of 8 bytes:
 one damaged file in 10^19 would go unnoticed; it proves no origin.
@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
-from ..files import MOST_HASHED, open_file
+from .errors import InputError
+from .files import MOST_HASHED, open_file
 
 SUM_BYTES = 8
 MOST_RANGES = 256
