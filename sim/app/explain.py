@@ -27,7 +27,8 @@ from ..diagnose import run_diagnosis
 from ..diagnose.capture import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
-from ..diagnose.report.wording import found_effects, remains
+from ..diagnose.report.effect_words import found_effects
+from ..diagnose.report.wording import remains
 from ..diagnose.run_diagnosis import REFITTED, DiagnoseOptions
 from ..diagnose.track.track_input import BodyRequest, VideoTrial, parse_body
 from ..errors import InputError

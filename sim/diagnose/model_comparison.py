@@ -31,7 +31,7 @@ from ..effects.registry import effects
 from .against_none import against_none, nominal_or_refitted, worsens
 from .comparison_settings import VOCABULARY, ComparisonSettings
 from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, FittedModels, Verdict
-from .report.wording import effect_label
+from .report.effect_words import effect_label
 
 TWINS: Mapping[str, tuple[str, ...]] = {
     "time_scale": ("buoyancy",),

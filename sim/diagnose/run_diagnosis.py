@@ -39,7 +39,8 @@ from .model_comparison import (
     kind_of,
 )
 from .provenance import provenance
-from .report.wording import effect_label, verdict_summary
+from .report.effect_words import effect_label
+from .report.wording import verdict_summary
 from .suggested_experiments import next_experiment, recorded_setting
 from .verification_run import VerificationRun, run_verification
 from .work import RIGID_RATE, SOFT_RATE, Work, WorkRecord

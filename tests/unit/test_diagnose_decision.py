@@ -26,7 +26,8 @@ from physgen.sim.diagnose.diagnosis import (
 )
 from physgen.sim.diagnose.gap_metrics import carried_residual, localise
 from physgen.sim.diagnose.model_comparison import ModelComparison, compare_models
-from physgen.sim.diagnose.report.wording import alternatives_sentence, assumptions, verdict_summary
+from physgen.sim.diagnose.report.assumptions import assumptions
+from physgen.sim.diagnose.report.wording import alternatives_sentence, verdict_summary
 from physgen.sim.diagnose.run_diagnosis import found_fit
 from physgen.sim.diagnose.suggested_experiments import next_experiment, recorded_setting
 from physgen.sim.errors import InputError
@@ -477,7 +478,7 @@ def test_a_verdict_of_none_does_not_explain_more_than_noise_and_grain_do():
 
 def test_every_effect_has_words_and_an_experiment():
     from physgen.sim.diagnose.model_comparison import kind_of
-    from physgen.sim.diagnose.report.wording import LABELS
+    from physgen.sim.diagnose.report.effect_words import LABELS
     from physgen.sim.effects.registry import effects
 
     vocabulary = [name for name in effects() if name != "sandy"]

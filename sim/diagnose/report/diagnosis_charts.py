@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ...html import Markup, Picture, element, join, label, short_number, shortened, translated
 from ..capture import Capture
 from ..diagnosis import PHASES, Diagnosis, IntervalShare, RankedEffect
+from .effect_words import PHASES as PHASE_WORDS
+from .effect_words import effect_label, found_effects
 from .number_format import counted, number_text, percent_text, tick_text
-from .wording import PHASES as PHASE_WORDS
-from .wording import effect_label, found_effects
 
 Array = NDArray[np.float64]
 

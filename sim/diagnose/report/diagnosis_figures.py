@@ -14,10 +14,10 @@ from ..capture import Capture, Trial
 from ..capture_geometry import mean_known
 from ..diagnosis import Diagnosis, TrialArrays
 from .diagnosis_charts import Scale, curve, is_root, ranking_picture, timeline_picture
+from .effect_words import found_effects, found_label
 from .number_format import axis_unit, counted, quantity_text, tick_text
 from .object_heatmaps import object_pictures
 from .trajectory_plots import MAX_TAKES, camera_plane, tracks_legend, tracks_pictures
-from .wording import found_effects, found_label
 
 Array = NDArray[np.float64]
 

@@ -15,22 +15,17 @@ from ...page_style import page_style, picture_style
 from ...version import VERSION
 from ..capture import Capture
 from ..diagnosis import NONE, PAGE_FILE, SAME, UNKNOWN, Diagnosis
+from .assumptions import assumptions
 from .diagnosis_charts import ALWAYS, LEAST, bands, bar_class
 from .diagnosis_figures import Pictures, draw_pictures, gap_bars
+from .effect_words import DIRECTIONS, PHASES, alternative_label, effect_label, found_effects, listed
 from .number_format import counted, estimate_text, finite_or_zero, number_text, percent_text, quantity_text
 from .object_heatmaps import VIEWS
 from .wording import (
-    DIRECTIONS,
-    PHASES,
-    alternative_label,
     alternatives_sentence,
-    assumptions,
     closure_sentence,
     control_sentences,
-    effect_label,
-    found_effects,
     headline,
-    listed,
     meaning,
     remains,
     shares_sentence,

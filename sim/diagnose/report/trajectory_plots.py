@@ -15,8 +15,8 @@ from ..capture import Camera, Capture, Trial
 from ..capture_geometry import mean_known
 from ..diagnosis import Diagnosis, TrialArrays
 from .diagnosis_charts import curve
+from .effect_words import found_effects, found_label
 from .number_format import axis_unit, quantity_text, tick_text, with_unit
-from .wording import found_effects, found_label
 
 Array = NDArray[np.float64]
 _NOWHERE = 1e6

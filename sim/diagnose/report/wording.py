@@ -1,120 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Words of the report: effect names, sentences, assumptions and the summary."""
+"""Sentences on a verdict: headline, meaning, gap closure, controls, and the summary."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from types import MappingProxyType
+from collections.abc import Iterable
 
-from ...html import shortened
-from ..capture import Capture, CaptureObject
+from ..capture import Capture
 from ..diagnosis import NONE, UNKNOWN, Diagnosis, Gap, Verdict
+from .effect_words import MEANINGS, alternative_label, effect_label, found_effects, listed
 from .number_format import LEAST_LENGTH_M, number_text, percent_text, quantity_text
-
-LABELS = MappingProxyType(
-    {
-        "air_drag": "air drag",
-        "wind": "wind",
-        "magnus": "Magnus lift",
-        "buoyancy": "buoyancy",
-        "gravity_tilt": "tilted ground",
-        "tether": "a hidden tether",
-        "friction": "friction",
-        "restitution": "restitution",
-        "rolling_resistance": "rolling resistance",
-        "adhesion": "adhesion",
-        "stiffness": "stiffness",
-        "internal_damping": "internal damping",
-        "plastic_yield": "plastic yield",
-        "anisotropy": "anisotropic stiffness",
-        "stiffness_gradient": "a stiffness gradient",
-        "sandy": "granular breakup",
-        "mass_offset": "an off-centre mass",
-        "inertia": "the moment of inertia",
-        "time_scale": "the recording's clock rate",
-        "camera_pose": "the camera pose",
-        NONE: "nothing missing",
-        UNKNOWN: "unknown cause",
-    }
-)
-
-_MEANING = MappingProxyType(
-    {
-        "air_drag": "Air resistance slows the real object; the simulation had none.",
-        "wind": "Moving air pushes the real object; the simulation had still air or none.",
-        "magnus": "The real object spins, and the air deflects it sideways like a curve ball.",
-        "buoyancy": "The real object falls as if it were lighter: the surrounding medium carries part of its weight.",
-        "gravity_tilt": "Gravity is not along the simulated vertical: the ground or the camera's level is tilted.",
-        "tether": "Something unmodelled holds or pulls the real object towards a fixed point.",
-        "friction": "Friction is higher or lower than assumed.",
-        "restitution": "The real object bounces more or less than assumed.",
-        "rolling_resistance": "The real object loses speed while rolling; the simulated one does not.",
-        "adhesion": "The surface holds the real object back as it separates.",
-        "stiffness": "The material is stiffer or softer than assumed.",
-        "internal_damping": "The material damps its own vibration faster than assumed.",
-        "plastic_yield": "The real object keeps dents; the simulated one springs back.",
-        "anisotropy": "The material is stiffer along one direction, like wood along the grain.",
-        "stiffness_gradient": "The material is stiffer on one side than on the other.",
-        "sandy": "The material breaks up into grains at some point.",
-        "mass_offset": "The centre of mass is not in the middle: something heavy sits to one side.",
-        "inertia": "The mass is not spread evenly: a hollow object is harder to turn, one with a heavy core easier.",
-        "time_scale": "The recording's clock runs fast or slow; the scene itself is right.",
-        "camera_pose": "The camera was not quite where it was assumed to be; the scene itself is right.",
-        NONE: "No effect needs to be added.",
-        UNKNOWN: "Something acts that none of the known effects describes.",
-    }
-)
-
-PHASES = MappingProxyType({"flight": "in flight", "impact": "at impacts", "contact": "in contact", "rest": "at rest"})
-
-DIRECTIONS = MappingProxyType(
-    {
-        "normal": "along the ground normal",
-        "along_velocity": "along the motion",
-        "along_gravity": "vertical, off the ground",
-        "other": "in other directions",
-    }
-)
-
-
-def effect_label(name: str) -> str:
-    """Return the label of an effect, or of several joined by "+"; unknown names without underscores."""
-    parts = [part.strip() for part in name.split("+")]
-    return listed([LABELS.get(part, part.replace("_", " ")) for part in parts], "and")
-
-
-def listed(words: Sequence[str], conjunction: str) -> str:
-    """Return "a", "a and b" or "a, b and c"."""
-    if len(words) < 2:
-        return "".join(words)
-    return f"{', '.join(words[:-1])} {conjunction} {words[-1]}"
-
-
-def found_effects(verdict: Verdict) -> tuple[str, ...]:
-    """Return the names of the effects that the verdict adds; () for ``none`` and ``unknown``."""
-    if verdict.effect in (NONE, UNKNOWN):
-        return ()
-    return verdict.effects or (verdict.effect,)
-
-
-_AFTER = MappingProxyType(
-    {
-        "friction": "corrected friction",
-        "restitution": "corrected restitution",
-        "stiffness": "corrected stiffness",
-        "time_scale": "corrected clock rate",
-        "camera_pose": "corrected camera pose",
-        "gravity_tilt": "tilted ground",
-    }
-)
-"""Effects that change an existing property or the recording; all others are added."""
-
-
-def found_label(verdict: Verdict) -> str:
-    """Return the label of the model with the verdict's effects, such as "with air drag"."""
-    names = found_effects(verdict)
-    return f"with {listed([_AFTER.get(n, effect_label(n)) for n in names], 'and')}" if names else "no effect added"
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -159,17 +54,11 @@ def meaning(diagnosis: Diagnosis, capture: Capture) -> str:
             "may be off in a way that is not modelled, such as its scale, its view or a body that is not as assumed."
         )
     names = found_effects(verdict) or (verdict.effect,)
-    said = [_against_belief(n, diagnosis, capture) or _MEANING[n] for n in names if n in _MEANING]
+    said = [_against_belief(n, diagnosis, capture) or MEANINGS[n] for n in names if n in MEANINGS]
     if verdict.effect == UNKNOWN:
         why = next((item.reason for item in diagnosis.effects if item.name == NONE), "")
         said += [f"The nominal model is ruled out: {why}."] if why else []
     return " ".join(said)
-
-
-def alternative_label(verdict: Verdict, name: str) -> str:
-    """Return the label of the alternative ``name``; one of several causes that the verdict names is one "alone"."""
-    several = found_effects(verdict)
-    return f"{effect_label(name)} alone" if len(several) > 1 and name in several else effect_label(name)
 
 
 def alternatives_sentence(verdict: Verdict) -> str | None:
@@ -350,64 +239,6 @@ def shares_sentence(shares: Iterable[tuple[str, float]]) -> str | None:
     """Return "72 % in flight, 28 % at impacts", largest first, without negligible ones; None if none is left."""
     known = sorted(((s, n) for n, s in shares if math.isfinite(s) and s >= 0.005), key=lambda pair: (-pair[0], pair[1]))
     return ", ".join(f"{percent_text(share)} {name}" for share, name in known[:4]) or None
-
-
-MAX_OBJECTS = 8
-
-
-def assumptions(capture: Capture) -> list[str]:
-    """Return the assumptions of the nominal model, one sentence each."""
-    gravity, ground = capture.gravity, capture.ground
-    strength = math.hypot(*gravity)
-    straight = math.hypot(gravity[0], gravity[1]) < 1e-9 and gravity[2] < 0
-    way = "straight down" if straight else f"along ({', '.join(number_text(g) for g in gravity)})"
-    bounce = "not known" if ground.restitution is None else number_text(ground.restitution)
-    lines = [
-        f"Gravity is {number_text(strength)} m/s², {way}.",
-        f"The ground is flat, with friction {number_text(ground.friction)} and restitution {bounce}.",
-        *(_object(item) for item in capture.objects[:MAX_OBJECTS]),
-    ]
-    if len(capture.objects) > MAX_OBJECTS:
-        lines.append(f"{len(capture.objects) - MAX_OBJECTS} more objects are listed in capture.json.")
-    camera = capture.camera
-    if camera is not None:
-        lines.append(f"The camera is fixed at its given pose, with {camera.width} × {camera.height} pixels.")
-    noise = quantity_text(capture.noise_sigma, "m" if camera is None else "px")
-    lines.append(f"Tracking noise is {noise} per coordinate (standard deviation), independent for each.")
-    lines.append(
-        f"{_trials(capture)} The initial state of each trial (position, velocity, spin) was estimated from its first "
-        "frames."
-    )
-    if camera is None and all(len(trial.rest_points) == 1 for trial in capture.trials):
-        lines.append(
-            "One point is tracked, so that spin shows in the path alone: of Magnus lift only the product of strength "
-            "and spin is known."
-        )
-    return lines
-
-
-def _trials(capture: Capture) -> str:
-    whole, begun = len(capture.fit_trials), len(capture.predict_trials)
-    if whole != 1:
-        said = f"{whole} complete trials"
-    elif all(item.belief.rigid for item in capture.objects):
-        said = "One complete trial, whose second half judges what was fitted to the first"
-    else:
-        said = "One complete trial"
-    return f"{said}, and {begun} with only {'its' if begun == 1 else 'their'} first frames." if begun else f"{said}."
-
-
-def _object(item: CaptureObject) -> str:
-    belief = item.belief
-    name = shortened(item.name, 60)
-    if belief.youngs_modulus_pa is None:
-        material = "is rigid"
-    else:
-        material = (
-            f"is {belief.stiffness} (Young’s modulus {quantity_text(belief.youngs_modulus_pa, 'Pa')}, "
-            f"Poisson’s ratio {number_text(belief.poisson_ratio)})"
-        )
-    return f"“{name}” {material} with a density of {number_text(belief.density_kg_m3)} kg/m³."
 
 
 def verdict_summary(verdict: Verdict, gap: Gap) -> str:
