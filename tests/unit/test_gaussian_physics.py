@@ -14,8 +14,8 @@ from physgen.sim.gaussians.compose.body_distances import (
     point_cloud_distances,
     surface_distances,
 )
-from physgen.sim.gaussians.compose.composition_parts import resolve_penetration
 from physgen.sim.gaussians.compose.physical_body import PhysicalBody, StepOptions
+from physgen.sim.gaussians.compose.seating import resolve_penetration
 from physgen.sim.mpm.colliders import Collider, Surface, Track
 from physgen.sim.mpm.geometry.signed_distance import signed_distance
 
