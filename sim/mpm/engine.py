@@ -16,7 +16,7 @@ from .block_lists import BlockLists, bytes_of
 from .implicit import ImplicitSteps, Matter, StepReport
 from .kernels import layout, parallel_sorting, runtime, sorting, time_stepping
 from .kernels.constitutive_response import law_set
-from .kernels.kernel_arrays import AdhesionArrays, CouplingArrays, StepLimits, WorldArrays
+from .kernels.kernel_arrays import CouplingArrays, StepLimits
 from .kernels.kernel_bundles import Launcher
 from .kernels.lanes import Lanes
 from .kernels.runtime import new_array
@@ -26,6 +26,7 @@ from .packing import NewParticles, PackedWorlds
 from .particle_store import ParticleStore, State, new_rows, positions_of
 from .rigid.rigid_bodies import RigidBodies
 from .rigid.rigid_motion import advance_bodies, carry_colliders
+from .world_tables import WorldTables
 
 Array = NDArray[np.float64]
 
@@ -76,37 +77,18 @@ class Engine:
         self._most_rigid_bodies = int(numbers.world_integers[:, layout.RIGID_BODIES].max())
         self._touching = new_array(ti.f32, max(1, rigid_bodies.count))
         self.laws = numbers.laws
+        self.worlds = WorldTables(numbers)
         models = law_set(self.laws)
-        self.world_count = len(numbers.worlds)
-        self._running = new_array(ti.i32, self.world_count if lanes.parallel else 1)
-        self.field_count = len(numbers.fields)
-        self._mean_fields = self.field_count if numbers.field_integers[:, layout.WANTS_MEANS].any() else 0
+        self._running = new_array(ti.i32, self.worlds.count if lanes.parallel else 1)
         several = bool((numbers.world_integers[:, layout.FIELDS] > 1).any())
         anchored = bool(numbers.field_integers[:, layout.HAS_ANCHORS].any())
         self._several = several
         self._thin = several and numbers.thin
         self.retries = 0
         self._implicit: ImplicitSteps | None = None
-        self._table = upload_new(numbers.table)
-        self._world_integers = upload_new(numbers.world_integers)
-        self._world_numbers = upload_new(numbers.worlds)
-        self._field_integers = upload_new(numbers.field_integers)
-        self._field_world = numbers.field_integers[:, layout.WORLD].copy()
-        self._fields = upload_new(numbers.fields)
-        self._touches = upload_new(numbers.touches)
-        self._pairs = upload_new(numbers.pairs)
-        self._adheres = numbers.adheres
-        self._adhesion = _new_adhesion(numbers)
-        self._means = new_array(ti.f32, max(1, self.field_count) * layout.MEAN_ROW)
-        self._control = new_array(ti.f64, self.world_count * layout.CONTROL_ROW)
-        control = np.zeros((self.world_count, layout.CONTROL_ROW))
-        control[:, layout.CFL_SCALE] = 1.0
-        control[:, layout.STATUS] = layout.DONE
-        control[:, layout.LONGEST_STEP] = math.inf
-        self._put_control(control)
         self.particles = ParticleStore(capacity=capacity, models=models, several=several, anchored=anchored)
         self._blocks = BlockLists(
-            field_count=self.field_count,
+            field_count=self.worlds.field_count,
             rigid_bodies=self._most_rigid_bodies,
             flowing=models.flowing,
             fluid=bool(models.volumetric),
@@ -114,30 +96,11 @@ class Engine:
             windows=windows,
         )
 
-    # ---- arrays -------------------------------------------------------------------------------------------------
-
     @property
     def device_bytes(self) -> int:
         """Bytes of all arrays."""
-        arrays = [a for a in (*vars(self).values(), *self._adhesion) if isinstance(a, ti.Ndarray)]
-        return self._blocks.device_bytes + self.particles.device_bytes + sum(bytes_of(a) for a in arrays)
-
-    def control(self) -> Array:
-        """Progress of the worlds (W, CONTROL_ROW), as ``layout`` names its columns."""
-        return np.asarray(self._control.to_numpy().reshape(self.world_count, layout.CONTROL_ROW))
-
-    def _put_control(self, control: Array) -> None:
-        self._control.from_numpy(np.ascontiguousarray(control).ravel())
-
-    def set_rows(self, *, worlds: NDArray[np.float32], fields: NDArray[np.float32]) -> None:
-        """Set the parameters of worlds and fields for the next segment of time."""
-        self._world_numbers.from_numpy(np.ascontiguousarray(worlds, dtype=np.float32).ravel())
-        if self.field_count:
-            self._fields.from_numpy(np.ascontiguousarray(fields, dtype=np.float32).ravel())
-
-    def set_materials(self, table: NDArray[np.float32]) -> None:
-        """Set the rows of the materials for the next segment of time."""
-        self._table.from_numpy(np.ascontiguousarray(table, dtype=np.float32).ravel())
+        own = bytes_of(self._touching) + bytes_of(self._running)
+        return self._blocks.device_bytes + self.particles.device_bytes + self.worlds.device_bytes + own
 
     # ---- particles in and out -----------------------------------------------------------------------------------
 
@@ -146,19 +109,19 @@ class Engine:
         state = self._download()
         parts = {name: [state[name]] for name in self.particles.names}
         all_keys = [state["keys"].astype(np.int64)]
-        control, means = self.control(), self._means.to_numpy()
+        control, means = self.worlds.control(), self.worlds.means()
         for added, wave_speed in groups:
             new, keys = new_rows(added)
             for name in self.particles.names:
                 parts[name].append(new[name])
             all_keys.append(keys)
-            row = control[self._field_world[added.field]]
+            row = control[self.worlds.of_field[added.field]]
             row[layout.SPEED] = max(row[layout.SPEED], math.sqrt(float(np.max((added.v**2).sum(axis=1)))))
             row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
             first = added.field * layout.MEAN_ROW + layout.MEAN_PLACE
             means[first : first + 3] = np.average(added.x, axis=0, weights=added.constants[:, 0])
-        self._put_control(control)
-        self._means.from_numpy(means)
+        self.worlds.put_control(control)
+        self.worlds.put_means(means)
         keys = np.concatenate(all_keys)
         # Fields one after the other, whenever they started.
         order = np.argsort(keys >> 48, kind="stable")
@@ -167,14 +130,6 @@ class Engine:
         for name in self.particles.names:
             self.particles.put(name, np.concatenate(parts.pop(name))[order])
         self._begin(keys[order])
-
-    def expect(self, world: int, *, speed: float = 0.0, wave_speed: float = 0.0) -> None:
-        """Let the next substep of ``world`` be stable for particles and waves of these speeds, cells/s."""
-        control = self.control()
-        row = control[world]
-        row[layout.SPEED] = max(row[layout.SPEED], speed)
-        row[layout.WAVE_SPEED] = max(row[layout.WAVE_SPEED], wave_speed)
-        self._put_control(control)
 
     def places(self) -> tuple[NDArray[np.int32], Array]:
         """Numbers (n,) of the particles as the caller counts, and their positions (n, 3) in cells."""
@@ -201,15 +156,15 @@ class Engine:
         """All that ``restore`` needs, particles in engine order, and "position" (n, 3) in cells."""
         state = self._download()
         state["position"] = positions_of(state["keys"].astype(np.int64), state["x"])
-        state["control"] = self.control()
-        state["means"] = self._means.to_numpy()
+        state["control"] = self.worlds.control()
+        state["means"] = self.worlds.means()
         return state
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Restore a state that ``state`` returned, on an engine of the same capacity and worlds."""
         self._upload(state, np.asarray(state["keys"], dtype=np.int64))
-        self._put_control(np.asarray(state["control"], dtype=np.float64))
-        self._means.from_numpy(np.asarray(state["means"], dtype=np.float32))
+        self.worlds.put_control(np.asarray(state["control"], dtype=np.float64))
+        self.worlds.put_means(np.asarray(state["means"], dtype=np.float32))
 
     def replace(self, state: State) -> None:
         """Replace the particles by ``state``, which the caller has changed, in the same order."""
@@ -220,7 +175,7 @@ class Engine:
     def _sort(self) -> None:
         """Group the particles anew after they have moved; ``v`` and ``C`` must be stored."""
         rebase = parallel_sorting.rebase_of(self._lanes) if self._lanes.parallel else sorting.rebase
-        rebase.launch(self.particles["x"], self.particles.keys, self._worlds(), self._blocks.particle_blocks)
+        rebase.launch(self.particles["x"], self.particles.keys, self.worlds.arrays(), self._blocks.particle_blocks)
         self._group()
 
     def _group(self, *, again: bool = False) -> None:
@@ -229,13 +184,13 @@ class Engine:
         if not again:
             self._blocks.build(here.count, here["x"], here.keys, here.targets)
         here.sort(again=again)
-        self._blocks.list_contacts(self._worlds(), self.rigid_bodies, several=self._several)
+        self._blocks.list_contacts(self.worlds.arrays(), self.rigid_bodies, several=self._several)
 
     # ---- time ---------------------------------------------------------------------------------------------------
 
     def stable_steps(self) -> Array:
         """Longest stable substep in s of each world (W,) for its state as last reported."""
-        return self._stable_steps(self.control())
+        return self._stable_steps(self.worlds.control())
 
     def _stable_steps(self, control: Array) -> Array:
         scale = control[:, layout.CFL_SCALE]
@@ -251,7 +206,7 @@ class Engine:
         Raises Diverged when a world diverges and shorter steps do not help. All worlds are then as they were when
         they were last sorted, ELAPSED s after the call.
         """
-        control = self.control()
+        control = self.worlds.control()
         control[:, layout.LONGEST_STEP] = longest_step
         control[:, layout.REMAINING] = durations
         control[:, layout.ELAPSED] = 0.0
@@ -259,45 +214,45 @@ class Engine:
         control[:, layout.LOST_FIELD] = -1.0
         control[:, layout.STATUS] = np.where(durations > 0, layout.WANTS_SORT, layout.DONE)
         control[:, layout.SHORTEST_STEP] = np.maximum(LEAST_STEP, 1e-3 * self._stable_steps(control))
-        attempts = np.zeros(self.world_count, dtype=np.int64)
+        attempts = np.zeros(self.worlds.count, dtype=np.int64)
         while (control[:, layout.STATUS] == layout.WANTS_SORT).any():
-            self._put_control(control)
-            means = self._means.to_numpy() if self._mean_fields else None
+            self.worlds.put_control(control)
+            means = self.worlds.means() if self.worlds.mean_fields else None
             before = self.rigid_bodies.state() if self.rigid_bodies.count else None
             self._sort()
             while True:
-                prime_worlds.launch(self._limits(), self._worlds())
+                prime_worlds.launch(self._limits(), self.worlds.arrays())
                 self._run_substeps(stop, self._expected_launches(control))
-                after = self.control()
+                after = self.worlds.control()
                 lost = after[:, layout.STATUS] == layout.DIVERGED
                 if not lost.any():
                     break
                 attempts[lost] += 1
                 self.particles.unsort()
                 if means is not None:
-                    self._means.from_numpy(means)
+                    self.worlds.put_means(means)
                 if before is not None:
                     self.rigid_bodies.put_back(before)
                 self._group(again=True)
                 if attempts.max() > MOST_RETRIES:
-                    self._put_control(control)
+                    self.worlds.put_control(control)
                     world = int(np.argmax(attempts))
                     raise Diverged(world, int(after[world, layout.LOST_FIELD]))
                 self.retries += 1
                 control[lost, layout.CFL_SCALE] *= 0.5
-                self._put_control(control)
+                self.worlds.put_control(control)
             sorted_now = control[:, layout.STATUS] == layout.WANTS_SORT
             attempts[sorted_now] = 0
             control = after
             recovered = np.minimum(1.0, RECOVER * control[:, layout.CFL_SCALE])
             control[:, layout.CFL_SCALE] = np.where(sorted_now, recovered, control[:, layout.CFL_SCALE])
-        self._put_control(control)
+        self.worlds.put_control(control)
 
     def add_elapsed(self, seconds: float) -> None:
         """Count ``seconds`` before the last ``advance``, which diverged, among those that have passed."""
-        control = self.control()
+        control = self.worlds.control()
         control[:, layout.ELAPSED] += seconds
-        self._put_control(control)
+        self.worlds.put_control(control)
 
     @property
     def bodies_meet(self) -> bool:
@@ -306,12 +261,12 @@ class Engine:
 
     def begin_implicit(self) -> None:
         """Make the particles ready for implicit steps."""
-        control = self.control()
+        control = self.worlds.control()
         control[:, layout.STATUS] = layout.WANTS_SORT
-        self._put_control(control)
+        self.worlds.put_control(control)
         self._sort()
         control[:, layout.STATUS] = layout.DONE
-        self._put_control(control)
+        self.worlds.put_control(control)
 
     def implicit_step(self, dt: float, gravity: Array, most_hit: float) -> StepReport:
         """An implicit step of the only world, see ``ImplicitSteps.step``."""
@@ -320,7 +275,7 @@ class Engine:
         blocks = self._blocks
         rigid = self.rigid_bodies
         matter = Matter(
-            worlds=self._worlds(),
+            worlds=self.worlds.arrays(),
             blocks=blocks.particle_blocks,
             grid=blocks.grid_blocks,
             near=blocks.near_blocks,
@@ -329,14 +284,14 @@ class Engine:
             colliders=rigid.bodies,
             shapes=rigid.shapes,
         )
-        control = self.control()
+        control = self.worlds.control()
         report = self._implicit.step(dt, gravity, most_hit, float(control[0, layout.WAVE_SPEED]), matter)
         if report.done:
             if rigid.count:
                 carry_colliders.launch(dt, rigid.bodies)
             control[0, layout.SPEED] = report.speed
             control[0, layout.SUBSTEPS] += 1.0
-            self._put_control(control)
+            self.worlds.put_control(control)
         return report
 
     def _expected_launches(self, control: Array) -> int:
@@ -358,11 +313,11 @@ class Engine:
             if stop():
                 raise Stopped
             rigid = self.rigid_bodies
-            advance_bodies(self._limits(), self._worlds(), rigid.bodies, rigid.shapes, rigid.contacts)
+            advance_bodies(self._limits(), self.worlds.arrays(), rigid.bodies, rigid.shapes, rigid.contacts)
             return
         launch = self._launcher().bind(self._arguments())
         if not (self._lanes.parallel and self.particles.count):
-            self._running[0] = self.world_count
+            self._running[0] = self.worlds.count
             while self._running[0] > 0:
                 if stop():
                     raise Stopped
@@ -384,10 +339,10 @@ class Engine:
             runtime.generation(),
             self.laws,
             self._lanes,
-            self._mean_fields > 0,
+            self.worlds.mean_fields > 0,
             self._blocks.any_overlap,
             self._thin,
-            self._adheres,
+            self.worlds.adheres,
             self.rigid_bodies.count > 0,
             self.rigid_bodies.solved_together,
             self._blocks.any_near,
@@ -399,7 +354,7 @@ class Engine:
         """Arguments of the substep's kernels by the kernels' parameter names."""
         return {
             "limits": self._limits(),
-            "worlds": self._worlds(),
+            "worlds": self.worlds.arrays(),
             "blocks": self._blocks.particle_blocks,
             "grid": self._blocks.grid_blocks,
             "near": self._blocks.near_blocks,
@@ -414,48 +369,9 @@ class Engine:
             "coupling": CouplingArrays(
                 self.rigid_bodies.count, self._most_rigid_bodies, self._touching, self._blocks.pushes
             ),
-            "adhesion": self._adhesion,
+            "adhesion": self.worlds.adhesion,
             "running": self._running,
         }
 
     def _limits(self) -> StepLimits:
         return StepLimits(self.cfl_elastic, self.cfl_velocity)
-
-    def _worlds(self) -> WorldArrays:
-        return WorldArrays(
-            count=self.world_count,
-            mean_fields=self._mean_fields,
-            integers=self._world_integers,
-            numbers=self._world_numbers,
-            field_integers=self._field_integers,
-            field_numbers=self._fields,
-            contacts=self._touches,
-            pairs=self._pairs,
-            materials=self._table,
-            control=self._control,
-            means=self._means,
-        )
-
-
-def _new_adhesion(numbers: PackedWorlds) -> AdhesionArrays:
-    """The arrays of bonds; empty where nothing adheres."""
-    touches, pairs = numbers.touch_adhesion, numbers.pair_adhesion
-    if not numbers.adheres:
-        touches, pairs = touches[:0], pairs[:0]
-    return AdhesionArrays(
-        touch_count=len(touches),
-        pair_count=len(pairs),
-        touches=upload_new(touches),
-        pairs=upload_new(pairs),
-        touch_sums=new_array(ti.i64, max(1, len(touches))),
-        pair_sums=new_array(ti.i64, max(1, len(pairs))),
-    )
-
-
-def upload_new(values: NDArray[np.generic]) -> ti.Ndarray:
-    """A new array on the device with the numbers of ``values``, flat; at least one long."""
-    kind = ti.i32 if values.dtype == np.int32 else ti.f32
-    array = new_array(kind, max(1, values.size))
-    if values.size:
-        array.from_numpy(np.ascontiguousarray(values).ravel())
-    return array

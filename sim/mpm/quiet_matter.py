@@ -99,7 +99,7 @@ class QuietMatter:
 
     def _longest(self, engine: Engine, most_hit: float) -> float:
         """Longest implicit step in s that the motion allows."""
-        speed = max(float(engine.control()[0, layout.SPEED]), self._collider_speed)
+        speed = max(float(engine.worlds.control()[0, layout.SPEED]), self._collider_speed)
         step = longest_step(most_hit, self._pull)
         # The speed at the end of the step, falling.
         return min(step, FARTHEST / max(speed + self._pull * step, 1e-12))
@@ -143,7 +143,7 @@ class QuietMatter:
             longest = self._longest(engine, most_hit)
             dt = left / math.ceil(left / longest - 1e-6)
             # In a step of gravity alone.
-            ahead = (float(engine.control()[0, layout.SPEED]) + self._pull * dt + self._collider_speed) * dt
+            ahead = (float(engine.worlds.control()[0, layout.SPEED]) + self._pull * dt + self._collider_speed) * dt
             if drift + ahead > DRIFT:
                 engine.begin_implicit()
                 drift = 0.0

@@ -17,8 +17,9 @@ from . import packing
 from .active_bodies import ActiveBodies
 from .bodies import BodyParticles
 from .colliders import SAME_TIME, Track
-from .engine import Engine, upload_new
+from .engine import Engine
 from .particle_store import State, places_in_blocks
+from .world_tables import upload_new
 
 Array = NDArray[np.float64]
 
@@ -63,11 +64,11 @@ class BodyChanges:
                     self._shares[number] = upload_new(packing.modulus_shares(body, choice, place.cells))
                 offset, shares = int(self._bodies.offsets[number]), self._shares[number]
                 self._engine.particles.set_moduli(offset, shares, material.shear_number, material.bulk_number)
-                self._engine.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
+                self._engine.worlds.expect(place.world, wave_speed=body.bounding_speed(material, place.cells.scale))
                 self._followed[number] = material
                 changed = True
         if changed:
-            self._engine.set_materials(packing.material_table(self._places, list(middle)))
+            self._engine.worlds.set_materials(packing.material_table(self._places, list(middle)))
 
     def change_material(self, place: packing.WorldSlot, index: int, now: float) -> None:
         """Switch the body's particles to their material at ``now``; their history variables are reset."""
@@ -78,7 +79,7 @@ class BodyChanges:
         choice = material_choice(place.setup.bodies[index], now)
         wave_speed = _switch_material(state, self.rows(state, number), place, index, choice)
         self._engine.replace(state)
-        self._engine.expect(place.world, wave_speed=wave_speed)
+        self._engine.worlds.expect(place.world, wave_speed=wave_speed)
 
     def set_velocity(self, place: packing.WorldSlot, index: int, velocity: Array) -> None:
         """Set the body's mean velocity (3,), m/s."""
@@ -86,7 +87,7 @@ class BodyChanges:
         rows = self.rows(state, self._number(place, index))
         fastest = _shift_velocity(state, rows, velocity * place.cells.scale)
         self._engine.replace(state)
-        self._engine.expect(place.world, speed=fastest)
+        self._engine.worlds.expect(place.world, speed=fastest)
 
     def set_motion(self, place: packing.WorldSlot, index: int, given: dict[str, Array]) -> None:
         """Set the motion of every particle of the body to what is ``given``, see ``checked_motion``."""
@@ -94,7 +95,7 @@ class BodyChanges:
         _put_motion(state, self.rows(state, self._number(place, index)), place, index, given)
         self._engine.replace(state)
         fastest = float(np.linalg.norm(given["velocities"], axis=1).max())
-        self._engine.expect(place.world, speed=fastest * place.cells.scale)
+        self._engine.worlds.expect(place.world, speed=fastest * place.cells.scale)
 
     def rows(self, state: State, number: int) -> BodyRows:
         """Return which particles of ``state`` are those of body ``number`` of all."""

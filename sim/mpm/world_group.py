@@ -112,7 +112,7 @@ class WorldGroup:
 
     def control(self, world: int) -> Array:
         """Progress of world ``world`` as the engine keeps it, see ``layout``."""
-        return self._engine.control()[world]
+        return self._engine.worlds.control()[world]
 
     def stable_step(self, world: int) -> float:
         """Longest substep in s that the present state of world ``world`` allows."""
@@ -153,7 +153,7 @@ class WorldGroup:
                     for place in self._places
                 ]
             )
-            self._engine.set_rows(
+            self._engine.worlds.set_rows(
                 worlds=np.stack([packing.world_row(p, self._times[p.world], stops[p.world]) for p in self._places]),
                 fields=packing.field_rows(self._places, list(self._times), list(stops)),
             )
@@ -170,7 +170,7 @@ class WorldGroup:
                 self._between = True
                 raise Cancelled("the simulation was stopped in the middle of a step") from None
             except Diverged as failure:
-                self._times = self._times + self._engine.control()[:, layout.ELAPSED]
+                self._times = self._times + self._engine.worlds.control()[:, layout.ELAPSED]
                 raise self._lost(failure) from None
             before = self._times.copy()
             self._times = stops
@@ -198,7 +198,7 @@ class WorldGroup:
         watched = [place for place in self._places if self._bodies.may_wake(place.world)]
         if not watched:
             return until
-        speeds = self._engine.control()[:, layout.SPEED]
+        speeds = self._engine.worlds.control()[:, layout.SPEED]
         fresh = []
         for place in watched:
             world, now = place.world, float(self._times[place.world])

@@ -112,4 +112,4 @@ def test_adhesion_without_a_partner_in_reach_changes_nothing(box, options, simil
     for world in (plain, far):
         world.advance(0.05)
     assert plain.positions(0).tobytes() == far.positions(0).tobytes()
-    assert not plain.group._engine._adheres and far.group._engine._adheres
+    assert not plain.group._engine.worlds.adheres and far.group._engine.worlds.adheres

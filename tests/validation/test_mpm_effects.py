@@ -275,15 +275,19 @@ def test_numbers_of_matter_reach_the_kernels(box, options, similarity):
     plain = under(setup, [], similarity, options)[0].group._engine
     damped = under(setup, [effect("internal_damping", damping_time=3e-3)], similarity, options)[0].group._engine
     assert damped.laws == plain.laws | DAMPED
-    assert damped._table.to_numpy()[1] == np.float32(3e-3)
+    assert damped.worlds.arrays().materials.to_numpy()[1] == np.float32(3e-3)
     yielding = under(setup, [effect("plastic_yield", yield_stress=2e3)], similarity, options)[0].group._engine
     assert yielding.laws == 1 << VonMisesMaterial.number
-    assert yielding._table.to_numpy()[2] == pytest.approx(math.sqrt(2 / 3) * 2e3 / (2 * shear), rel=1e-6)
+    assert yielding.worlds.arrays().materials.to_numpy()[2] == pytest.approx(
+        math.sqrt(2 / 3) * 2e3 / (2 * shear), rel=1e-6
+    )
     fibred = under(
         setup, [effect("anisotropy", fibre_modulus=3e5, axis_x=0.0, axis_y=0.5, axis_z=0.0)], similarity, options
     )[0].group._engine
     assert fibred.laws == plain.laws | FIBRED
-    assert fibred._table.to_numpy()[6:10] == pytest.approx([3e5 / (2 * shear), 0.0, 1.0, 0.0], rel=1e-6)
+    assert fibred.worlds.arrays().materials.to_numpy()[6:10] == pytest.approx(
+        [3e5 / (2 * shear), 0.0, 1.0, 0.0], rel=1e-6
+    )
     stiffer = under(setup, [effect("stiffness", factor=3.0)], similarity, options)[0].group._engine
     ratio = stiffer.state()["constants"][:, 1:3] / plain.state()["constants"][:, 1:3]
     assert ratio == pytest.approx(np.full_like(ratio, 3.0), rel=1e-6)
@@ -475,13 +479,13 @@ def test_absent_effects_cost_nothing(box, options, similarity):
     changed = under(setup, light, similarity, options)
     for worlds in (plain, changed):
         assert worlds[0].group._engine.laws == 1
-        assert worlds[0].group._engine._mean_fields == 0
+        assert worlds[0].group._engine.worlds.mean_fields == 0
         assert worlds[0].group._engine.particles.names == plain[0].group._engine.particles.names
         assert worlds.device_bytes == plain.device_bytes
     for item in (effect("magnus", lift_per_mass=0.1), tether(10.0, 0.1, 1.0, 1.0)):
         worlds = under(setup, [item], similarity, options)
         assert worlds[0].group._engine.laws == 1
-        assert worlds[0].group._engine._mean_fields == 1
+        assert worlds[0].group._engine.worlds.mean_fields == 1
         assert worlds.device_bytes == plain.device_bytes
 
 
