@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from ..sim.app.launch import STOP_SIGNALS
-from ..sim.events import Event, IsCancelled
+from ..sim.events import Event, IsCancelled, stage_words
 
 STOP_S = 1.3
 """A command has ended so long after it was asked to stop, by itself or not."""
@@ -180,7 +180,7 @@ class Terminal:
         self._last_line = now
         message = str(event.get("message") or event.get("step") or "")
         left = float(event["job_eta_s"])
-        text = f"{stage:<11} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed"
+        text = f"{stage_words(stage):<17} {done:>4}/{total:<4} {message:<22} {_clock(now - self._started)} elapsed"
         if left >= 1.0:
             # Less is not known: a stage that has ended, or whose pace has not shown yet, is no promise.
             text += f", about {_clock(left)} left"

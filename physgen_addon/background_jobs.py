@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..sim.errors import Cancelled, PhysGenError, SimulationError
-from ..sim.events import Event, IsCancelled, OnEvent
+from ..sim.events import Event, IsCancelled, OnEvent, stage_words
 from .compat import OperatorMixin
 from .context import TAB, redraw, scene_with
 from .interpreter import NoPython
@@ -370,12 +370,13 @@ def start_chosen(
 
 
 def progress_text(job: Job) -> str:
-    """Return progress as text, such as ``Diagnose: fits 40 %, 12 s left``; elapsed time if what is left is unknown, so
-    that a long step is seen to go on.
+    """Return progress as text, such as ``Render: writing the video 40 %, 12 s left``; elapsed time if what is left is
+    unknown, so that a long step is seen to go on.
     """
-    # "Reconstruction: reconstruct" says nothing that "Reconstruction" does not.
-    is_told = not job.stage or job.stage.lower()[:5] == job.title.lower()[:5]
-    text = job.title if is_told else f"{job.title}: {job.stage}"
+    # "Reconstruction: reconstructing" says nothing that "Reconstruction" does not.
+    words = stage_words(job.stage)
+    is_told = any(told.lower()[:5] == job.title.lower()[:5] for told in (job.stage, words)) or not job.stage
+    text = job.title if is_told else f"{job.title}: {words[:1].lower()}{words[1:]}"
     if job.fraction is not None:
         text += f" {100 * job.fraction:.0f} %"
         if job.eta_s is not None:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 Event = dict[str, Any]
@@ -24,6 +24,60 @@ def ignore(event: Event) -> None:
 def never() -> bool:
     """Return False: never cancelled."""
     return False
+
+
+STAGES: Mapping[str, str] = {
+    "batch": "Running the job",
+    "bake": "Simulating",
+    "bake before": "Simulating (before)",
+    "bake after": "Simulating (after)",
+    "compare": "Comparing",
+    "composing": "Fitting the objects",
+    "diagnose": "Trying causes",
+    "encode": "Writing the video",
+    "evaluate": "Measuring",
+    "export": "Exporting",
+    "fit": "Fitting",
+    "models": "Downloading",
+    "propose": "Finding objects",
+    "questionnaire": "Preparing clips",
+    "reconstruct": "Reconstructing",
+    "render": "Rendering",
+    "track": "Tracking",
+}
+"""What is being done in each stage, in the words of people; events keep the names."""
+
+STEPS: Mapping[str, str] = {
+    "photo": "reading the photo",
+    "propose objects": "looking for objects",
+    "segment": "cutting out",
+    "physics": "choosing materials",
+    "camera": "estimating the camera",
+    "shadows": "finding shadows",
+    "order": "finding what is in front",
+    "complete": "completing",
+    "mesh": "shaping",
+    "gloss": "finding mirror images",
+    "background": "filling the background",
+    "light": "estimating the light",
+    "look of": "estimating the surface of",
+    "write": "writing the scene",
+    "report": "writing the report",
+}
+"""What is being done in each step of a reconstruction; the name of an object may follow."""
+
+
+def stage_words(stage: str) -> str:
+    """Return what is being done in ``stage`` as words to show, such as ``Finding objects``; an unknown one as it is."""
+    return STAGES.get(stage, stage)
+
+
+def step_words(step: str) -> str:
+    """Return what is being done in ``step`` as words to show, such as ``cutting out cup`` for ``segment cup``."""
+    if step in STEPS:
+        return STEPS[step]
+    verb = next((verb for verb in STEPS if step.startswith(f"{verb} ")), "")
+    return f"{STEPS[verb]}{step.removeprefix(verb)}" if verb else step
 
 
 class StageProgress:

@@ -198,7 +198,7 @@ def _read_inputs(folder: Scene, options: BakeOptions, progress: StageProgress, g
     for name in changed_files(folder, [item.mesh for item in folder.model.objects]):
         progress.notice(f"{folder.root / name}: is not what was written when the scene was made: damaged, or edited")
     inputs = inputs_hash(folder, options)
-    progress.report(0, "sampling particles")
+    progress.report(0, "filling objects with particles")
     meshes = [load_object_mesh(folder, item) for item in folder.model.objects]
     splats = [load_object_splats(folder, *pair) for pair in zip(folder.model.objects, meshes, strict=True)]
     geometry = folder.geometry_hash()

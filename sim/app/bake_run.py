@@ -114,7 +114,7 @@ class BakeRun:
             until = self.manifest.frames if self.mended is None else self.mended.samples
             for index in range(first := self.frames_done, until):
                 compiling = index <= max(first, 1)
-                progress.report(index, "compiling" if compiling else "", paced=not compiling)
+                progress.report(index, "preparing the simulator" if compiling else "", paced=not compiling)
                 self.frame_started = time.monotonic()
                 self._advance_to(index, cancelled)
                 self._append_samples(index, writers, cancelled)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..atomic import replacing
 from ..errors import Cancelled, InputError
-from ..events import IsCancelled, OnEvent
+from ..events import IsCancelled, OnEvent, step_words
 from ..npz import read_npz
 from ..validation import json_value, to_json
 
@@ -37,8 +37,8 @@ class Steps:
     def begin(self, name: str) -> None:
         """Begin the step ``name``. Raises Cancelled when cancelled."""
         if self.cancelled():
-            raise Cancelled(f"reconstruction cancelled before step {name!r}; nothing was written")
-        event = {"event": "progress", "stage": self._stage, "step": name, "message": name}
+            raise Cancelled(f"reconstruction cancelled before {step_words(name)}; nothing was written")
+        event = {"event": "progress", "stage": self._stage, "step": name, "message": step_words(name)}
         self._on_event({**event, "done": self._done, "total": self._total})
         self._done += 1
 

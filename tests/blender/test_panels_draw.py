@@ -252,6 +252,18 @@ def test_a_job_of_frames_says_which_it_is_at(stage, done, words):
     assert " ".join(layout.words[1:]) == words
 
 
+def test_progress_says_what_is_done_in_the_words_of_the_command_line():
+    def told(title, stage):
+        job = background_jobs.Job(title, lambda on_event, cancelled: {})
+        job._take({"event": "progress", "stage": stage, "done": 2, "total": 4})
+        return background_jobs.progress_text(job).partition(",")[0]
+
+    assert told("Finding objects", "propose") == "Finding objects 50 %"
+    assert told("Reconstruction", "reconstruct") == "Reconstruction 50 %"
+    assert told("Bake", "bake") == "Bake 50 %" and told("Render", "encode") == "Render: writing the video 50 %"
+    assert told("Explanation", "track") == "Explanation: tracking 50 %"
+
+
 def test_a_bake_is_paused_and_other_jobs_are_cancelled():
     """Both would do the same to a bake."""
     a_body()

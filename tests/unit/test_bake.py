@@ -108,7 +108,7 @@ def test_a_scene_that_is_corrected_while_it_is_read_is_not_baked(ball_scene, tmp
     mesh = folder.file("meshes/ball0.glb")
 
     def corrected(event):
-        if event.get("message") == "sampling particles":
+        if event.get("message") == "filling objects with particles":
             other.file("meshes/ball0.glb").replace(mesh)
 
     with pytest.raises(InputError, match="was changed by another command while it was read"):
@@ -211,7 +211,7 @@ def test_sigterm_ends_the_worker_with_130(ball_scene, tmp_path):
     assert not (tmp_path / "bake" / ".lock").exists()
 
 
-@pytest.mark.parametrize("until", ["sampling", "about"])
+@pytest.mark.parametrize("until", ["filling", "about"])
 def test_a_worker_that_still_prepares_can_be_stopped(ball_scene, tmp_path, until):
     """Whether it hears of it or is in the middle of NumPy or a compiler: it says so, and is in no later bake's way."""
     folder = ball_scene()

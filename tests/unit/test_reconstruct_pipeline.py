@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 import pytest
 from physgen.sim.app.reconstruct import reconstruct
 from physgen.sim.errors import Cancelled, InputError
+from physgen.sim.events import step_words
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions, reconstruct_photo
 from physgen.sim.scene.folder import load_scene
 from physgen.sim.scene.meshes import load_object_mesh
@@ -151,6 +152,10 @@ def test_progress_counts_up_to_the_end(result):
     assert all(event["stage"] == "reconstruct" for event in events)
     assert [event["done"] for event in progress] == list(range(len(progress)))
     assert progress[-1]["done"] == progress[-1]["total"]
+    # People read what is being done, programs the names of the steps.
+    assert all(event["message"] == step_words(event["step"]) != event["step"] for event in progress[:-1])
+    assert {"segment ball", "gloss"} < {event["step"] for event in progress}
+    assert {"cutting out ball", "finding mirror images"} < {event["message"] for event in progress}
     json.dumps(events)
 
 

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The remaining time that a command shows, and what its terminal gets to see."""
 
+import ast
 import io
 import json
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen.batch.terminal import RemainingTime, Terminal
+from physgen.sim.events import STAGES, step_words
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Clock:
@@ -98,7 +103,7 @@ def test_names_from_a_strangers_folder_give_a_terminal_no_orders(capsys):
     terminal.error("InputError", HOSTILE)
     lines = written(stream).decode().splitlines()
     assert lines[:2] == [SHOWN, f"track: {SHOWN}"]
-    assert len(lines) == 3 and lines[2].startswith("bake") and f"{SHOWN} error: no" in lines[2]
+    assert len(lines) == 3 and lines[2].startswith("Simulating ") and f"{SHOWN} error: no" in lines[2]
     assert capsys.readouterr().err == f"error: {SHOWN}\n"
 
 
@@ -118,6 +123,39 @@ def test_a_terminal_that_lacks_a_character_gets_its_number():
     stream = out("ascii")
     Terminal(as_json=False, out=stream).line("photo → video")
     assert written(stream) == b"photo \\u2192 video\n"
+
+
+def test_every_stage_has_words_for_people():
+    """Terminals and Blender show what is being done, not the stage's name, which programs read."""
+    found = set()
+    for path in (path for folder in ("sim", "batch", "physgen_addon") for path in (ROOT / folder).rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        constants = {
+            target.id: node.value.value
+            for node in tree.body
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant)
+            for target in node.targets
+            if isinstance(target, ast.Name)
+        }
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > 1):
+            if isinstance(call.func, ast.Name) and call.func.id == "StageProgress":
+                stage = call.args[1]
+                found.add(stage.value if isinstance(stage, ast.Constant) else constants[stage.id])
+    assert {"bake", "render", "track", "evaluate"} < found <= set(STAGES)
+    stream = out()
+    Terminal(as_json=False, out=stream)(event("propose", 0, 2))
+    assert written(stream).decode().startswith("Finding objects ")
+    as_json = out()
+    Terminal(as_json=True, out=as_json)(event("propose", 0, 2))
+    assert json.loads(written(as_json))["stage"] == "propose"
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [("segment a cup", "cutting out a cup"), ("look of mesh 2", "estimating the surface of mesh 2"), ("x", "x")],
+)
+def test_a_step_is_told_with_the_name_of_its_object(step, words):
+    assert step_words(step) == words
 
 
 def test_no_line_promises_that_nothing_is_left():
