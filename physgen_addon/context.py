@@ -95,20 +95,34 @@ def show_whole(context: bpy.types.Context, scene: bpy.types.Scene, *, colours: s
             if bpy.ops.view3d.view_center_camera.poll():
                 bpy.ops.view3d.view_center_camera()
                 if context.preferences.system.use_region_overlap:
-                    _leave_sidebar_free(space.region_3d, region, area)
+                    _leave_sidebar_free(space.region_3d, region.width, area)
 
 
-def _leave_sidebar_free(view: bpy.types.RegionView3D, region: bpy.types.Region, area: bpy.types.Area) -> None:
-    """Shrink and shift the camera's frame, which fills ``region``, to where neither sidebar nor toolbar covers it."""
+def _leave_sidebar_free(view: bpy.types.RegionView3D, width: int, area: bpy.types.Area) -> None:
+    """Shrink and shift the camera's frame, which fills a region of ``width`` pixels, to where neither sidebar nor
+    toolbar covers it."""
     widths = {other.type: other.width for other in area.regions if other.width > 1}
     sidebar, tools = widths.get("UI", 0), widths.get("TOOLS", 0)
-    if not 0 < sidebar + tools < region.width / 2:
+    if not 0 < sidebar + tools < width / 2:
         return
-    free = (region.width - sidebar - tools) / region.width
+    free = (width - sidebar - tools) / width
     # As in Blender's BKE_screen_view3d_zoom_to_fac and BKE_camera_params_from_view3d.
     size = (math.sqrt(2) + view.view_camera_zoom / 50) ** 2 / 4 * free
     view.view_camera_zoom = (math.sqrt(4 * size) - math.sqrt(2)) * 50
-    view.view_camera_offset[0] += (sidebar - tools) / region.width / (4 * size)
+    view.view_camera_offset[0] += (sidebar - tools) / width / (4 * size)
+
+
+def zoom_of_whole(width: int, height: int, picture: tuple[float, float], *, fit: str) -> float:
+    """Return a viewport's zoom at which the camera's whole picture fits a region, as *Frame Camera Bounds* finds it.
+
+    width, height: of the region, pixels; also of one that has this size only later. picture: width and height of what
+    the camera sees, in any unit. fit: the camera's ``sensor_fit``.
+    """
+    # Without zoom, the picture's width, its height or the longer of both is as long as the region's.
+    longer = max(picture) if fit == "AUTO" else picture[fit == "VERTICAL"]
+    scale = {"AUTO": max(width, height), "HORIZONTAL": width, "VERTICAL": height}[fit] / longer
+    size = min(width / (scale * picture[0] + 4), height / (scale * picture[1] + 4))
+    return (math.sqrt(4 * size) - math.sqrt(2)) * 50
 
 
 def show_beside(context: bpy.types.Context, image: bpy.types.Image, tab: str) -> None:
@@ -214,7 +228,7 @@ def close_beside(scene: bpy.types.Scene) -> None:
     """Close the image editor that ``show_beside`` has opened, if it is still one; the viewport takes its place.
 
     In a moment: an operator that closes an editor loses what it reports. The photo of ``scene`` is fitted to the
-    viewport once that has its new size.
+    size that the viewport gets, before it is drawn with that.
     """
     if not bpy.app.background:
         bpy.app.timers.register(functools.partial(_close_split_off, scene.session_uid), first_interval=0.1)
@@ -222,18 +236,41 @@ def close_beside(scene: bpy.types.Scene) -> None:
 
 def _close_split_off(uid: int) -> None:
     for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.as_pointer() in _split_off and area.type == "IMAGE_EDITOR" and len(window.screen.areas) > 1:
-                with bpy.context.temp_override(window=window, area=area):
-                    bpy.ops.screen.area_close()
-                bpy.app.timers.register(functools.partial(_fit_again, uid), first_interval=0.2)
-                break
+        areas = window.screen.areas
+        area = next((a for a in areas if a.as_pointer() in _split_off and a.type == "IMAGE_EDITOR"), None)
+        if area is None or len(areas) < 2:
+            continue
+        beside = [a for a in areas if a.type == "VIEW_3D" and (a.y, a.height) == (area.y, area.height)]
+        view = min(beside, key=lambda a: max(area.x - a.x - a.width, a.x - area.x - area.width), default=None)
+        width = 0 if view is None else max(area.x + area.width, view.x + view.width) - min(area.x, view.x)
+        with bpy.context.temp_override(window=window, area=area):
+            bpy.ops.screen.area_close()
+        if view is not None and window.scene.session_uid == uid:
+            _fit_photo(window.scene, view, width)
+        bpy.app.timers.register(functools.partial(_fit_again, uid, width), first_interval=0.2)
     _split_off.clear()
 
 
-def _fit_again(uid: int) -> None:
+def _fit_photo(scene: bpy.types.Scene, area: bpy.types.Area, width: int) -> None:
+    """Fit the photo of ``scene`` to the viewport ``area`` as it is once it is ``width`` pixels wide."""
+    view, camera = area.spaces.active.region_3d, scene.camera
+    if view is None or view.view_perspective != "CAMERA" or camera is None or camera.type != "CAMERA":
+        return
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    wide = region.width + width - area.width
+    render = scene.render
+    size = render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
+    view.view_camera_offset = 0.0, 0.0
+    view.view_camera_zoom = zoom_of_whole(wide, region.height, size, fit=camera.data.sensor_fit)
+    if bpy.context.preferences.system.use_region_overlap:
+        _leave_sidebar_free(view, wide, area)
+
+
+def _fit_again(uid: int, width: int) -> None:
+    """Fit the photo where the viewport is not as wide as foreseen: another editor took the place."""
     # A timer has no window of its own.
     for window in bpy.context.window_manager.windows:
-        if window.scene.session_uid == uid:
+        views = [area for area in window.screen.areas if area.type == "VIEW_3D"]
+        if window.scene.session_uid == uid and all(area.width != width for area in views):
             with bpy.context.temp_override(window=window):
                 show_photo(bpy.context, window.scene)

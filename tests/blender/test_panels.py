@@ -11,7 +11,7 @@ bpy = pytest.importorskip("bpy")
 import physgen
 from mathutils import Vector
 from physgen import physgen_addon
-from physgen.physgen_addon import bake_state, text
+from physgen.physgen_addon import bake_state, context, text
 from physgen.physgen_addon.operators.photo_object_ops import cutouts_picture
 from physgen.physgen_addon.panels.sidebar import is_in
 from physgen.physgen_addon.props.body_props import bodies
@@ -69,6 +69,21 @@ def test_tooltips_are_one_paragraph_without_a_full_stop():
     for name in told:
         words = getattr(bpy.ops.physgen, name).get_rna_type().description
         assert words and "\n" not in words and not words.endswith((".", " ")), name
+
+
+@pytest.mark.parametrize(
+    ("fit", "picture", "narrow", "wide"),
+    [
+        ("HORIZONTAL", (600, 450), 28.908371, 29.099030),
+        ("HORIZONTAL", (450, 800), 26.349110, -2.136254),
+        ("AUTO", (600, 450), 6.220251, 29.099030),
+        ("AUTO", (450, 800), 29.062307, 20.645809),
+    ],
+)
+def test_a_whole_photo_has_the_zoom_that_blender_gives_it(fit, picture, narrow, wide):
+    """As Frame Camera Bounds of Blender 5.2.2 left it in viewports of these sizes."""
+    assert context.zoom_of_whole(522, 878, picture, fit=fit) == pytest.approx(narrow, abs=1e-4)
+    assert context.zoom_of_whole(1048, 878, picture, fit=fit) == pytest.approx(wide, abs=1e-4)
 
 
 def test_photos_are_chosen_by_thumbnail():

@@ -219,6 +219,39 @@ def sample_photo():
     return {"sample_photo_to_still_s": round(took, 1), "of_it": "pictures of the panel are taken on the way"}
 
 
+def fitted():
+    """The photo's editor closes, and the viewport that grows is drawn with the whole photo from the first time on."""
+    yield from home()
+    context = session.extension("physgen_addon.context")
+    with screens.focus():
+        bpy.ops.physgen.open_sample(sample="PHOTO")
+    yield 1.0
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = scene.physgen_photo.image.size
+    scene.camera.data.sensor_fit = "HORIZONTAL"
+    drawn = []
+
+    def note():
+        region, view = bpy.context.region, bpy.context.region_data
+        drawn.append((bpy.context.area.as_pointer(), region.width, round(view.view_camera_zoom, 2)))
+
+    with screens.focus():
+        context.show_photo(bpy.context, scene)
+    yield from screens.drawn()
+    noting = bpy.types.SpaceView3D.draw_handler_add(note, (), "WINDOW", "POST_PIXEL")
+    before = {area.as_pointer(): area.width for area in bpy.context.window.screen.areas if area.type == "VIEW_3D"}
+    context.close_beside(scene)
+    yield 1.0
+    yield from screens.drawn()
+    with screens.focus():
+        context.show_photo(bpy.context, scene)
+    yield from screens.drawn()
+    bpy.types.SpaceView3D.draw_handler_remove(noting, "WINDOW")
+    grown = [(width, zoom) for area, width, zoom in drawn if width > before[area]]
+    assert grown and len(set(grown)) == 1, f"width and zoom of the drawn viewport: {grown}"
+    yield from screens.shoot(SCREENS, "24_fitted")
+
+
 def a_photo():
     """The scene folder of the task and a short bake of it, unless the sample photo was reconstructed before."""
     if bpy.context.scene.physgen.folder:
@@ -362,6 +395,6 @@ def wanted(step) -> bool:
     return not TASK["only"] or step.__name__ in ("arranged", *TASK["only"].split(","))
 
 
-STEPS = [arranged, first_bake, by_panel, unbaked, refused, menus, sample_meshes, sample_photo, farm, nodes]
+STEPS = [arranged, first_bake, by_panel, unbaked, refused, menus, sample_meshes, fitted, sample_photo, farm, nodes]
 STEPS += [dropped, material, strange]
 session.run("tour", [step for step in STEPS if wanted(step)])
