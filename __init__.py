@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from .sim.app.propose import propose
     from .sim.app.reconstruct import Physics, reconstruct
     from .sim.cache.bake_folder import Bake, load_bake
-    from .sim.diagnose.capture import Capture, load_capture
+    from .sim.diagnose.capture import Capture
+    from .sim.diagnose.capture_folder import load_capture
     from .sim.diagnose.diagnosis import Diagnosis
     from .sim.diagnose.run_diagnosis import DiagnoseOptions
     from .sim.diagnose.track.track_command import track
@@ -138,7 +139,7 @@ _HOMES = {
     "export_usd": ".sim.app.export_usd",
     "import_capture": ".sim.app.import_capture",
     "load_bake": ".sim.cache.bake_folder",
-    "load_capture": ".sim.diagnose.capture",
+    "load_capture": ".sim.diagnose.capture_folder",
     "load_scene": ".sim.scene.folder",
     "make_questionnaire": ".sim.evaluate.questionnaire",
     "propose": ".sim.app.propose",

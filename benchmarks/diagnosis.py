@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from physgen.benchmarks.common import benchmark_parser
-from physgen.sim.diagnose.capture import CAPTURE_FILE, load_capture
+from physgen.sim.diagnose.capture_folder import CAPTURE_FILE, load_capture
 from physgen.sim.diagnose.diagnosis import write_diagnosis
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, diagnose
 from physgen.sim.errors import PhysGenError

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from ..sim.diagnose.against_none import nominal_or_refitted
 from ..sim.diagnose.comparison_settings import ComparisonSettings
-from ..sim.diagnose.diagnosis import NONE, UNKNOWN, CandidateFit
+from ..sim.diagnose.diagnosis import NONE, UNKNOWN
+from ..sim.diagnose.fits import CandidateFit
 from ..sim.diagnose.model_comparison import ModelComparison, compare_models
 from .fit_records import FitRecord
 from .scoring import calibration_error

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..sim.app.stage_process import own_command, run_stage
 from ..sim.atomic import write_json
-from ..sim.diagnose.capture import save_capture
+from ..sim.diagnose.capture_folder import save_capture
 from ..sim.diagnose.diagnosis import UNKNOWN
 from ..sim.effects.registry import effect
 from ..sim.errors import Cancelled, InputError, PhysGenError, SimulationError

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..sim.atomic import write_json
-from ..sim.diagnose.diagnosis import CandidateFit, Estimate, Fits
+from ..sim.diagnose.fits import CandidateFit, Estimate, Fits
 from ..sim.diagnose.run_diagnosis import DiagnoseOptions, allowed_work, fit_candidates
 from ..sim.errors import InputError, PhysGenError
 from ..sim.events import IsCancelled, never

@@ -141,7 +141,7 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
 def run_diagnose(options: argparse.Namespace, terminal: Terminal, cancelled: IsCancelled) -> int:
     """Run ``physgen diagnose``; the exit code."""
     from ...sim.app.diagnose import diagnose
-    from ...sim.diagnose.capture import load_capture
+    from ...sim.diagnose.capture_folder import load_capture
     from ...sim.diagnose.run_diagnosis import DiagnoseOptions
 
     settings = DiagnoseOptions(

@@ -10,7 +10,8 @@ import bpy
 from mathutils import Vector
 
 from ...sim.app.stage_process import run_stage
-from ...sim.diagnose.capture import CAPTURE_FILE, Capture, load_capture
+from ...sim.diagnose.capture import Capture
+from ...sim.diagnose.capture_folder import CAPTURE_FILE, load_capture
 from ...sim.diagnose.diagnosis import PAGE_FILE, REPORT_FILE, read_diagnosis
 from ...sim.errors import InputError
 from ...sim.events import Event, IsCancelled, OnEvent

@@ -24,7 +24,7 @@ from ..composite.side_by_side import (
     write_comparison,
 )
 from ..diagnose import run_diagnosis
-from ..diagnose.capture import load_capture, save_capture
+from ..diagnose.capture_folder import load_capture, save_capture
 from ..diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, write_diagnosis
 from ..diagnose.report import write_report
 from ..diagnose.report.effect_words import found_effects

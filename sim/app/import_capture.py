@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial, load_capture, save_capture
+from ..diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from ..diagnose.capture_folder import load_capture, save_capture
 from ..errors import InputError
 from ..events import OnEvent, ignore
 from ..files import read_text

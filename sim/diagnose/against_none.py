@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from .comparison_settings import VOCABULARY, ComparisonSettings
-from .diagnosis import CandidateFit, FittedModels
+from .fits import CandidateFit, FittedModels
 
 
 @dataclass(frozen=True, kw_only=True)

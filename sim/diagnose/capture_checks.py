@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import trimesh
 
 from ..errors import InputError
 from ..rigid_alignment import nearest_rotation
@@ -38,6 +37,8 @@ def check_capture(capture: Capture) -> Capture:
 
 
 def _check_mesh(item: CaptureObject, warnings: list[str]) -> None:
+    import trimesh
+
     extent = float(np.ptp(item.vertices, axis=0).max())
     if extent > LARGEST_M:
         raise InputError(

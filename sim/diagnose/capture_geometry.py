@@ -9,7 +9,7 @@ import numpy as np
 
 from ..effects.camera_pose import true_camera
 from .capture import Array, Camera, Capture, Trial
-from .diagnosis import CandidateFit
+from .fits import CandidateFit
 
 
 def mean_known(values: Array, axis: int | tuple[int, ...] | None = None) -> Array:

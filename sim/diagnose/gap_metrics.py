@@ -10,19 +10,8 @@ import numpy as np
 
 from .capture import Capture
 from .capture_geometry import mean_known, metres_per_unit, observed_residual
-from .diagnosis import (
-    DIRECTIONS,
-    NONE,
-    UNKNOWN,
-    Array,
-    CandidateFit,
-    Discrepancy,
-    Fits,
-    Gap,
-    IntervalShare,
-    Localisation,
-    ObjectShare,
-)
+from .diagnosis import NONE, UNKNOWN, Array, Gap, IntervalShare, Localisation, ObjectShare
+from .fits import DIRECTIONS, CandidateFit, Discrepancy, Fits
 from .model_comparison import RESOLVABLE, ModelComparison, closed_fraction
 
 RESAMPLES = 400

@@ -30,7 +30,8 @@ import numpy as np
 from ..effects.registry import effects
 from .against_none import against_none, nominal_or_refitted, worsens
 from .comparison_settings import VOCABULARY, ComparisonSettings
-from .diagnosis import NONE, SAME, UNKNOWN, CandidateFit, FittedModels, Verdict
+from .diagnosis import NONE, SAME, UNKNOWN, Verdict
+from .fits import CandidateFit, FittedModels
 from .report.effect_words import effect_label
 
 TWINS: Mapping[str, tuple[str, ...]] = {

@@ -16,21 +16,8 @@ from ..events import IsCancelled, OnEvent, ignore, never
 from .against_none import nominal_or_refitted
 from .capture import Capture
 from .comparison_settings import ComparisonSettings
-from .diagnosis import (
-    NONE,
-    UNKNOWN,
-    AddedEffect,
-    Array,
-    CandidateFit,
-    Diagnosis,
-    Discrepancy,
-    Fits,
-    FittedModels,
-    FoundPair,
-    Gap,
-    RankedEffect,
-    TrialArrays,
-)
+from .diagnosis import NONE, UNKNOWN, AddedEffect, Array, Diagnosis, FoundPair, Gap, RankedEffect, TrialArrays
+from .fits import CandidateFit, Discrepancy, Fits, FittedModels
 from .gap_metrics import bootstrap_interval, localise, measure_gap, negative_controls
 from .model_comparison import (
     ModelComparison,

@@ -29,7 +29,7 @@ from ..rigid_alignment import nearest_pose
 from ..scene.model import Effect as SceneEffect
 from .capture import Array, Capture, CaptureObject, Trial
 from .capture_geometry import mean_known, observed_distance
-from .diagnosis import CandidateFit
+from .fits import CandidateFit
 
 HORIZON_S = 1.0
 """Simulated duration for a rigid body, or one without contact."""

@@ -7,17 +7,10 @@ import trimesh
 
 bpy = pytest.importorskip("bpy")
 from physgen.physgen_addon.playback.geometry_nodes import COLOUR
-from physgen.sim.diagnose.capture import (
-    Capture,
-    CaptureObject,
-    Ground,
-    ObjectBelief,
-    Trial,
-    save_capture,
-)
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import save_capture
 from physgen.sim.diagnose.diagnosis import (
     Diagnosis,
-    Estimate,
     Gap,
     Localisation,
     ObjectShare,
@@ -26,6 +19,7 @@ from physgen.sim.diagnose.diagnosis import (
     Verdict,
     write_diagnosis,
 )
+from physgen.sim.diagnose.fits import Estimate
 
 RATE = 50.0
 FRAMES = 12

@@ -8,15 +8,8 @@ import trimesh
 bpy = pytest.importorskip("bpy")
 import physgen
 from physgen.physgen_addon.playback.geometry_nodes import RAMP
-from physgen.sim.diagnose.capture import (
-    Camera,
-    Capture,
-    CaptureObject,
-    Ground,
-    ObjectBelief,
-    Trial,
-    save_capture,
-)
+from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import save_capture
 
 from .diagnose_scenes import (
     FOUND_OFF,

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from physgen.sim.diagnose.capture import load_capture, save_capture
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 from physgen.sim.errors import InputError
 from physgen.sim.scene.folder import save_scene
 from physgen.sim.scene.material import load_preset

@@ -13,15 +13,8 @@ from physgen.blind_check.fit_records import load_records
 from physgen.sim.app.add_effect import found_effects, with_effects
 from physgen.sim.app.import_capture import ImportRequest, import_capture
 from physgen.sim.diagnose.capture import Camera as CaptureCamera
-from physgen.sim.diagnose.capture import (
-    Capture,
-    CaptureObject,
-    Ground,
-    ObjectBelief,
-    Trial,
-    load_capture,
-    save_capture,
-)
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 from physgen.sim.diagnose.diagnosis import read_diagnosis
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
 from physgen.sim.diagnose.track.track_input import VideoTrial, parse_body

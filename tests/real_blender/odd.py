@@ -280,7 +280,7 @@ def placed():
 def diagnose():
     """A recording that is loaded and diagnosed, and the panel for a video, which is refused without one."""
     yield from home()
-    session.a_capture(session.extension("sim.diagnose.capture"), OUT / "capture")
+    session.a_capture(session.extension("sim.diagnose.capture_folder"), OUT / "capture")
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     names = tuple(f"PHYSGEN_PT_diagnose{part}" for part in ("", "_show", "_causes", "_add"))
     with screens.only(names):

@@ -127,7 +127,7 @@ def throws(folder):
         turned = [np.array(Quaternion(Vector(turn).normalized(), Vector(turn).length * t).to_matrix()) for t in times]
         points = np.stack([marks @ r.T + x for r, x in zip(turned, path, strict=True)])
         trials[name] = times, points + 0.001 * rng.standard_normal(points.shape)
-    session.save_trials(session.extension("sim.diagnose.capture"), folder, trials, marks=marks, density=60.0)
+    session.save_trials(session.extension("sim.diagnose.capture_folder"), folder, trials, marks=marks, density=60.0)
 
 
 def diagnosis():

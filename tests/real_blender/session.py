@@ -60,7 +60,7 @@ def box(half: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def a_capture(form: Any, folder: Path) -> None:
-    """Save a recording of a box in flight, as points in space, in ``folder``; form: ``sim.diagnose.capture``."""
+    """Save a recording of a box in flight, as points in space, in ``folder``; form: ``sim.diagnose.capture_folder``."""
     corners, _ = box(0.05)
     times = np.arange(12) / 50.0
     places = np.stack([times, 0 * times, 0.5 + times - 4.9 * times**2], axis=1)
@@ -75,7 +75,7 @@ def save_trials(
     marks: np.ndarray,
     density: float,
 ) -> None:
-    """Save recordings of a box of 10 cm in ``folder``; form: ``sim.diagnose.capture``.
+    """Save recordings of a box of 10 cm in ``folder``; form: ``sim.diagnose.capture_folder``.
 
     trials: times (T,) in s and points (T, K, 3) in m by name. marks: (K, 3) places of the points on the box, m.
     density: what it is believed to be, kg/m³.

@@ -286,7 +286,7 @@ def capture_loaded():
     """A recording in the Diagnose panel."""
     bpy.ops.wm.read_homefile()
     yield from screens.show_sidebar()
-    session.a_capture(session.extension("sim.diagnose.capture"), OUT / "capture")
+    session.a_capture(session.extension("sim.diagnose.capture_folder"), OUT / "capture")
     bpy.context.scene.physgen_diagnose.capture = str(OUT / "capture")
     with screens.focus():
         assert bpy.ops.physgen.load_capture() == {"FINISHED"}

@@ -44,7 +44,7 @@ from physgen.sim.app.set_light import LightRequest, set_light
 from physgen.sim.cache.bake_folder import BakedObject, BakeManifest, load_bake, save_manifest
 from physgen.sim.cache.pc2 import Pc2Writer
 from physgen.sim.diagnose import run_diagnosis
-from physgen.sim.diagnose.capture import load_capture
+from physgen.sim.diagnose.capture_folder import load_capture
 from physgen.sim.evaluate.judge_question import CRITERIA
 from physgen.sim.evaluate.questionnaire_answers import collect_questionnaire
 from physgen.sim.folder_lock import LOCK_FILE, remove_dead_lock

@@ -11,7 +11,6 @@ import numpy as np
 from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
 from physgen.sim.diagnose.diagnosis import (
     Diagnosis,
-    Estimate,
     Gap,
     IntervalShare,
     Localisation,
@@ -20,6 +19,7 @@ from physgen.sim.diagnose.diagnosis import (
     TrialArrays,
     Verdict,
 )
+from physgen.sim.diagnose.fits import Estimate
 from physgen.sim.diagnose.report import write_report
 from physgen.sim.diagnose.report.trajectory_plots import camera_plane
 

@@ -20,7 +20,7 @@ from physgen.blind_check.mujoco_world import (
 )
 from physgen.blind_check.rigid_cases import SEARCH_STEP_S, rigid_case
 from physgen.blind_check.rigid_causes import KNOWN_CAUSES
-from physgen.sim.diagnose.capture import load_capture, save_capture
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 
 BALL = Body(shape="sphere", half=(0.04, 0.04, 0.04), density=400.0)
 CUBE = Body(shape="cube", half=(0.04, 0.04, 0.04), density=400.0)

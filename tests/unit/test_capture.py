@@ -9,16 +9,8 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.capture import (
-    Camera,
-    Capture,
-    CaptureObject,
-    Ground,
-    ObjectBelief,
-    Trial,
-    load_capture,
-    save_capture,
-)
+from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 from physgen.sim.errors import InputError
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -153,7 +145,7 @@ def test_objects_are_never_unpickled(folder):
 
 
 def test_an_archive_that_unpacks_to_too_much_is_refused_unread(folder, monkeypatch):
-    monkeypatch.setattr("physgen.sim.diagnose.capture.MAX_TRIAL_BYTES", 1000)
+    monkeypatch.setattr("physgen.sim.diagnose.capture_folder.MAX_TRIAL_BYTES", 1000)
     with pytest.raises(InputError, match="shorten the trial"):
         load_capture(folder)
 

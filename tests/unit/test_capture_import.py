@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from physgen.batch.cli import main
-from physgen.sim.diagnose.capture import load_capture
+from physgen.sim.diagnose.capture_folder import load_capture
 from physgen.sim.errors import InputError, PhysGenError
 from physgen.sim.importers.recordings import read_recording
 from scipy.spatial.transform import Rotation

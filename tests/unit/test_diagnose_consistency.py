@@ -11,16 +11,8 @@ import pytest
 import trimesh
 from physgen.sim.app.add_effect import found_effects
 from physgen.sim.app.diagnose import diagnose
-from physgen.sim.diagnose.capture import (
-    Camera,
-    Capture,
-    CaptureObject,
-    Ground,
-    ObjectBelief,
-    Trial,
-    load_capture,
-    save_capture,
-)
+from physgen.sim.diagnose.capture import Camera, Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 from physgen.sim.diagnose.diagnosis import read_diagnosis
 from physgen.sim.diagnose.provenance import content_hash
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions

@@ -11,19 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from physgen.sim.diagnose import diagnosis as files
 from physgen.sim.diagnose.comparison_settings import ComparisonSettings
-from physgen.sim.diagnose.diagnosis import (
-    NONE,
-    UNKNOWN,
-    CandidateFit,
-    Diagnosis,
-    Discrepancy,
-    Estimate,
-    Gap,
-    Localisation,
-    PhaseInterval,
-    TrialArrays,
-    Verdict,
-)
+from physgen.sim.diagnose.diagnosis import NONE, UNKNOWN, Diagnosis, Gap, Localisation, TrialArrays, Verdict
+from physgen.sim.diagnose.fits import CandidateFit, Discrepancy, Estimate, PhaseInterval
 from physgen.sim.diagnose.gap_metrics import carried_residual, localise
 from physgen.sim.diagnose.model_comparison import ModelComparison, compare_models
 from physgen.sim.diagnose.report.assumptions import assumptions

@@ -6,7 +6,8 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.report.object_heatmaps import View, colours, hex_colour, rasterise, simplified
+from physgen.sim.diagnose.report.mesh_raster import View, rasterise, simplified
+from physgen.sim.diagnose.report.object_heatmaps import colours, hex_colour
 
 FRONT = View(azimuth=0, elevation=0)
 

@@ -11,13 +11,8 @@ import re
 import numpy as np
 import pytest
 from physgen.sim.app.explain import title_of_cause
-from physgen.sim.diagnose.diagnosis import (
-    Estimate,
-    Gap,
-    Localisation,
-    RankedEffect,
-    Verdict,
-)
+from physgen.sim.diagnose.diagnosis import Gap, Localisation, RankedEffect, Verdict
+from physgen.sim.diagnose.fits import Estimate
 from physgen.sim.diagnose.report.diagnosis_charts import bands, timeline_picture
 from physgen.sim.diagnose.report.diagnosis_figures import growth
 from physgen.sim.diagnose.report.diagnosis_page import scene_effects

@@ -13,15 +13,8 @@ import physgen
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.diagnosis import (
-    Estimate,
-    Gap,
-    IntervalShare,
-    Localisation,
-    ObjectShare,
-    RankedEffect,
-    Verdict,
-)
+from physgen.sim.diagnose.diagnosis import Gap, IntervalShare, Localisation, ObjectShare, RankedEffect, Verdict
+from physgen.sim.diagnose.fits import Estimate
 from physgen.sim.diagnose.provenance import Provenance
 from physgen.sim.diagnose.report import diagnosis_figures, parameter_text
 from physgen.sim.diagnose.report.diagnosis_charts import Scale, _apart

@@ -18,11 +18,12 @@ from physgen.sim.diagnose.rigid.observed_poses import (
     turns_on_a_face,
 )
 from physgen.sim.diagnose.rigid.quaternions import as_matrix, from_rotvec, multiply
-from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS, BodyScene
+from physgen.sim.diagnose.rigid.rigid_candidates import CANDIDATE_EFFECTS
 from physgen.sim.diagnose.rigid.rigid_fits import REFITS, shown_keys
 from physgen.sim.diagnose.rigid.rigid_localisation import _directions
 from physgen.sim.diagnose.rigid.rigid_simulator import SLOTS, RigidWorlds, rigid_body
 from physgen.sim.diagnose.rigid.start_numbers import MissingForces, tether_start
+from physgen.sim.diagnose.rigid.world_settings import BodyScene
 from physgen.sim.effects.registry import effect
 
 RADIUS = 0.04

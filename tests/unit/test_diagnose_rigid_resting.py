@@ -14,9 +14,9 @@ from physgen.sim.diagnose.rigid.held_out_score import middle_frame
 from physgen.sim.diagnose.rigid.observed_poses import fit_rotation, observe_body, project
 from physgen.sim.diagnose.rigid.quaternions import as_matrix, from_rotvec
 from physgen.sim.diagnose.rigid.resting_contact import height, resting_state
-from physgen.sim.diagnose.rigid.rigid_candidates import BodyScene
 from physgen.sim.diagnose.rigid.rigid_search import body_problem
 from physgen.sim.diagnose.rigid.rigid_simulator import rigid_body
+from physgen.sim.diagnose.rigid.world_settings import BodyScene
 from physgen.sim.diagnose.work import Work
 
 SIZE = (0.12, 0.08, 0.05)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from physgen.batch.cli import main
 from physgen.benchmarks.diagnosis import quick_capture
-from physgen.sim.diagnose.capture import load_capture
+from physgen.sim.diagnose.capture_folder import load_capture
 from physgen.sim.diagnose.diagnosis import report_json
 from physgen.sim.diagnose.rigid.rigid_simulator import RigidWorlds
 from physgen.sim.diagnose.run_diagnosis import DiagnoseOptions, cut_off, diagnose

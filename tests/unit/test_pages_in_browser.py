@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from physgen.batch.farm.job_monitor import summarize, summary_page
 from physgen.batch.farm.planning.plan import Outcome
-from physgen.sim.diagnose.diagnosis import Estimate, Provenance, RankedEffect
+from physgen.sim.diagnose.diagnosis import Provenance, RankedEffect
+from physgen.sim.diagnose.fits import Estimate
 from physgen.sim.diagnose.report import write_report
 from physgen.sim.evaluate.evaluation import HIGHER, LOWER, Curve, Evaluation, Measure, Section
 from physgen.sim.evaluate.judge_question import CRITERIA

@@ -9,9 +9,9 @@ import physgen
 import pytest
 import trimesh
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief
-from physgen.sim.diagnose.rigid.rigid_candidates import BodyScene
 from physgen.sim.diagnose.rigid.rigid_search import body_problem
 from physgen.sim.diagnose.rigid.rigid_simulator import RigidWorlds, on_its_rim
+from physgen.sim.diagnose.rigid.world_settings import BodyScene
 from physgen.sim.diagnose.track.plain_bodies import follow_plain_body
 from physgen.sim.diagnose.track.track_input import parse_body
 from physgen.sim.diagnose.work import Work

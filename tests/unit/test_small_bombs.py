@@ -16,7 +16,7 @@ from physgen.batch.farm.planning.job_file import load_job
 from physgen.sim import atomic
 from physgen.sim.app.scene_bodies import colliders_of
 from physgen.sim.cache.bake_folder import BakedObject, free_bake, save_manifest
-from physgen.sim.diagnose.capture import load_capture
+from physgen.sim.diagnose.capture_folder import load_capture
 from physgen.sim.errors import InputError
 from physgen.sim.folder_lock import folder_lock
 from physgen.sim.importers.coco_masks import masks_from_json
@@ -176,13 +176,13 @@ def capture(tmp_path):
 
 def test_trials_together_unpack_to_a_bounded_size(capture, monkeypatch):
     assert len(load_capture(capture).trials) == 2
-    monkeypatch.setattr("physgen.sim.diagnose.capture.MAX_CAPTURE_BYTES", 4_000_000)
+    monkeypatch.setattr("physgen.sim.diagnose.capture_folder.MAX_CAPTURE_BYTES", 4_000_000)
     with pytest.raises(InputError, match="its trials take more than"):
         load_capture(capture)
 
 
 def test_small_numbers_of_a_trial_count_as_what_they_become(capture, monkeypatch):
-    monkeypatch.setattr("physgen.sim.diagnose.capture.MAX_TRIAL_BYTES", 1_000_000)
+    monkeypatch.setattr("physgen.sim.diagnose.capture_folder.MAX_TRIAL_BYTES", 1_000_000)
     arrays = {"times": np.arange(1000.0), "points": np.zeros((1000, 100, 3), np.uint8), "object_index": np.zeros(100)}
     np.savez_compressed(capture / "take.npz", rest_points=np.zeros((100, 3)), **arrays)
     with pytest.raises(InputError, match="more numbers than fit"):
@@ -190,7 +190,7 @@ def test_small_numbers_of_a_trial_count_as_what_they_become(capture, monkeypatch
 
 
 def test_meshes_that_a_capture_names_again_and_again_are_bounded(capture, monkeypatch):
-    monkeypatch.setattr("physgen.sim.diagnose.capture.MAX_CAPTURE_BYTES", 4_900_000)
+    monkeypatch.setattr("physgen.sim.diagnose.capture_folder.MAX_CAPTURE_BYTES", 4_900_000)
     document = json.loads((capture / "capture.json").read_text())
     trimesh.creation.icosphere(5).export(capture / "box.ply")
     document["objects"] = [{**document["objects"][0], "name": f"o{i}"} for i in range(20)]

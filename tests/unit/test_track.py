@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physgen.sim.diagnose.capture import load_capture
+from physgen.sim.diagnose.capture_folder import load_capture
 from physgen.sim.diagnose.track.track_command import add_arguments, parse_trials, run_command, track
 from physgen.sim.diagnose.track.track_input import TrackOptions, VideoTrial, belief_warnings
 from physgen.sim.diagnose.track.track_videos import track_video, track_videos, withhold

@@ -23,7 +23,7 @@ from physgen.sim.app.reconstruct import Physics, _inputs_hash, set_all_physics, 
 from physgen.sim.app.reconstruct_record import Request, stamp_to_json
 from physgen.sim.cache.bake_check import unchanged_bake
 from physgen.sim.cache.bake_folder import load_bake, save_manifest
-from physgen.sim.diagnose.capture import load_capture, save_capture
+from physgen.sim.diagnose.capture_folder import load_capture, save_capture
 from physgen.sim.errors import Cancelled, InputError
 from physgen.sim.processes import own_mark, parse_mark
 from physgen.sim.reconstruct import ObjectRequest, ReconstructOptions
@@ -111,7 +111,7 @@ def test_what_was_finished_while_waiting_for_the_folder_is_not_replaced(work, mo
 
     for module, save in (
         ("physgen.sim.app.pack_bake", lambda out: pack_bake(bake, out=out)),
-        ("physgen.sim.diagnose.capture", lambda out: save_capture(capture, out)),
+        ("physgen.sim.diagnose.capture_folder", lambda out: save_capture(capture, out)),
     ):
         out = work / module
         held = sys.modules[module].lock_beside

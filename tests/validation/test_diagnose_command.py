@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.batch.cli import main
-from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial, save_capture
+from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
+from physgen.sim.diagnose.capture_folder import save_capture
 from physgen.sim.diagnose.diagnosis import read_diagnosis
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from physgen.sim.diagnose.capture import Capture, CaptureObject, Ground, ObjectBelief, Trial
-from physgen.sim.diagnose.diagnosis import CandidateFit, Estimate
+from physgen.sim.diagnose.fits import CandidateFit, Estimate
 from physgen.sim.diagnose.verification_run import rotate_vectors, run_verification, starting_state
 from scipy.spatial.transform import Rotation
 

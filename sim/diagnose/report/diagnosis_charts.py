@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ...html import Markup, Picture, element, join, label, short_number, shortened, translated
 from ..capture import Capture
-from ..diagnosis import PHASES, Diagnosis, IntervalShare, RankedEffect
+from ..diagnosis import Diagnosis, IntervalShare, RankedEffect
+from ..fits import PHASES
 from .effect_words import PHASES as PHASE_WORDS
 from .effect_words import effect_label, found_effects
 from .number_format import counted, number_text, percent_text, tick_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from ..diagnosis import Estimate
+from ..fits import Estimate
 
 NOTHING = "–"
 """Placeholder for a missing number."""

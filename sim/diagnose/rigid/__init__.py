@@ -5,7 +5,7 @@ A single rigid body above a plane has a model that is exact in flight and cheap 
 proposes causes; the particle engine verifies them.
 
 rigid_fits.py          all candidates of a capture, fitted, in order; rigid_candidates.py what they are,
-                       start_numbers.py where their fits begin
+                       world_settings.py what they change, start_numbers.py where their fits begin
 rigid_search.py        the search for one effect; pair_search.py for two, rigid_refits.py what is fitted again after
 multiple_shooting.py   a fit; shooting_problem.py its residuals and normal equations, segment_paths.py the paths that it
                        simulates, segmented_trial.py trials split at nodes

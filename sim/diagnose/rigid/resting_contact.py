@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from .observed_poses import QUATERNION, ObservedBody, frame_pose
 from .quaternions import as_matrix, from_rotvec, multiply
-from .rigid_candidates import BodyScene
+from .world_settings import BodyScene
 
 Array = NDArray[np.float64]
 

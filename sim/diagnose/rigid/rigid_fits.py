@@ -16,20 +16,13 @@ from ...errors import Cancelled, InputError
 from ...events import IsCancelled, OnEvent, StageProgress, ignore, never
 from ..capture import Capture, Trial
 from ..comparison_settings import SHARED
-from ..diagnosis import CandidateFit, Discrepancy, Estimate
+from ..fits import CandidateFit, Discrepancy, Estimate
 from ..work import Work
 from .bending import bending
 from .held_out_score import HeldOutScore, noise_floor, score_held_out
 from .multiple_shooting import Fit
 from .pair_search import BASE_GAIN, search_pairs
-from .rigid_candidates import (
-    BELIEFS,
-    CANDIDATE_EFFECTS,
-    FRICTION_SPREAD,
-    RESTITUTION_SPREAD,
-    BodyScene,
-    CandidateEffect,
-)
+from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, FRICTION_SPREAD, RESTITUTION_SPREAD, CandidateEffect
 from .rigid_localisation import localise_discrepancies
 from .rigid_misfit import misfit
 from .rigid_prediction import (
@@ -56,6 +49,7 @@ from .rigid_search import (
     reconsider_nominal,
 )
 from .shared_spins import share_spins
+from .world_settings import BodyScene
 
 Array = NDArray[np.float64]
 

@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
-from ..diagnosis import DIRECTIONS, Discrepancy, PhaseInterval
+from ..fits import DIRECTIONS, Discrepancy, PhaseInterval
 from .multiple_shooting import Fit
 from .observed_poses import CONTACT, QUATERNION, SPIN, TOUCHED, VELOCITY, project
 from .quaternions import as_matrix
-from .rigid_candidates import BELIEFS, WorldSettings
+from .rigid_candidates import BELIEFS
 from .rigid_prediction import world_points
 from .segment_paths import Model
 from .segmented_trial import Segment, SegmentedTrial
 from .shooting_problem import Problem
+from .world_settings import WorldSettings
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from .multiple_shooting import Fit
 from .observed_poses import QUATERNION, TOUCHED
-from .rigid_candidates import WorldSettings
 from .segmented_trial import Segment, SegmentedTrial
 from .shooting_problem import Problem
+from .world_settings import WorldSettings
 
 BEND_EVERY = 0.05
 """Time in s per polynomial degree of the smooth remainder."""

@@ -17,7 +17,7 @@ from ..work import Work
 from .contact_uncertainty import weight_contacts
 from .multiple_shooting import Fit, solve
 from .observed_poses import TOUCHED, frame_pose, observe_body, turns_on_a_face
-from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, BodyScene, CandidateEffect, tether_numbers
+from .rigid_candidates import BELIEFS, CANDIDATE_EFFECTS, CandidateEffect, tether_numbers
 from .rigid_misfit import misfit
 from .rigid_simulator import RigidWorlds, on_its_rim, rigid_body
 from .segment_paths import Model
@@ -25,6 +25,7 @@ from .segmented_trial import Evaluation
 from .shooting_problem import CONTACT_DEGREES_OF_FREEDOM, Problem
 from .start_numbers import missing_forces, tether_start
 from .state_tracking import initial_camera, track_states
+from .world_settings import BodyScene
 
 Array = NDArray[np.float64]
 

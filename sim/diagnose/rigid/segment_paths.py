@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .observed_poses import perturbed
-from .rigid_candidates import BELIEFS, BodyScene, CandidateEffect, WorldSettings
+from .rigid_candidates import BELIEFS, CandidateEffect
 from .rigid_simulator import RigidWorlds
 from .segmented_trial import SegmentedTrial
+from .world_settings import BodyScene, WorldSettings
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from .observed_poses import QUATERNION, PointMoments, points_information, state_difference
 from .quaternions import as_rotvec, conjugate, from_rotvec, multiply
 from .resting_contact import height
-from .rigid_candidates import BELIEFS, BodyScene, WorldSettings
+from .rigid_candidates import BELIEFS
 from .rigid_simulator import RigidWorlds
 from .segment_paths import Model, Paths, Worlds, simulate_segments, worlds_of
 from .segmented_trial import Evaluation, NormalEquations, Segment, SegmentedTrial
+from .world_settings import BodyScene, WorldSettings
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -15,11 +15,11 @@ from .multiple_shooting import eliminate_states
 from .observed_poses import PUSHED, QUATERNION, SPIN, TOUCHED, VELOCITY, ObservedBody, frame_pose, perturbed
 from .quaternions import as_matrix
 from .resting_contact import height, resting_state
-from .rigid_candidates import BodyScene
 from .rigid_simulator import RigidWorlds
 from .segment_paths import Model
 from .segmented_trial import Segment, SegmentedTrial
 from .shooting_problem import Problem
+from .world_settings import BodyScene
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from ...errors import InputError
 from ...events import IsCancelled, OnEvent
 from ..capture import Capture
 from ..comparison_settings import ComparisonSettings
-from ..diagnosis import DIRECTIONS, CandidateFit, Discrepancy, Estimate, PhaseInterval
+from ..fits import DIRECTIONS, CandidateFit, Discrepancy, Estimate, PhaseInterval
 from ..work import Work
 from .candidate_survey import FoundFit, Survey
 from .contact_search import LOST, ContactFit

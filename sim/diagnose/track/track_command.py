@@ -16,7 +16,8 @@ from ...atomic import replacing
 from ...errors import InputError
 from ...events import Event, IsCancelled, OnEvent, ignore, never
 from ...scene.folder import Scene, load_scene
-from ..capture import Capture, Trial, load_capture, save_capture
+from ..capture import Capture, Trial
+from ..capture_folder import load_capture, save_capture
 from .track_input import BodyRequest, TrackOptions, VideoTrial, parse_body
 
 
