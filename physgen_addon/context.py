@@ -94,7 +94,7 @@ def show_whole(context: bpy.types.Context, scene: bpy.types.Scene, *, colours: s
         with context.temp_override(window=context.window, area=area, region=region):
             if bpy.ops.view3d.view_center_camera.poll():
                 bpy.ops.view3d.view_center_camera()
-                if context.preferences.system.use_region_overlap:
+                if region is not None and context.preferences.system.use_region_overlap:
                     _leave_sidebar_free(space.region_3d, region.width, area)
 
 
