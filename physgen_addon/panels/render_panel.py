@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 import gpu
 
-from .. import blend_trust, text
+from .. import blend_trust, compat, text
 from ..background_jobs import running
 from ..operators.export_ops import PHYSGEN_OT_export_alembic, PHYSGEN_OT_export_usd, PHYSGEN_OT_make_independent
 from ..operators.farm_ops import PHYSGEN_OT_copy_farm_command, PHYSGEN_OT_farm, command, written
@@ -71,6 +71,11 @@ def _draw_photo_render(layout: bpy.types.UILayout, context: bpy.types.Context) -
     row.operator(PHYSGEN_OT_render_still.bl_idname, icon="RENDER_STILL")
     row.operator(PHYSGEN_OT_render_video.bl_idname, icon="RENDER_ANIMATION")
     draw_result(layout, rendering)
+    if context.scene.render.engine == compat.eevee():
+        words = (
+            "F12 and the viewport, by Blender's EEVEE, have no shadows on the ground. These buttons have, and Cycles."
+        )
+        text.sentences(layout, context, words, icon="INFO")
 
 
 def _draw_own_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from physgen import physgen_addon
-from physgen.physgen_addon import background_jobs, bake_state, handlers, text
+from physgen.physgen_addon import background_jobs, bake_state, compat, handlers, text
 from physgen.physgen_addon.context import TAB
 from physgen.physgen_addon.operators.photo_object_ops import PHYSGEN_OT_find_objects, add_found, found_words
 from physgen.physgen_addon.operators.photo_ops import add_box
@@ -262,6 +262,18 @@ def test_progress_says_what_is_done_in_the_words_of_the_command_line():
     assert told("Reconstruction", "reconstruct") == "Reconstruction 50 %"
     assert told("Bake", "bake") == "Bake 50 %" and told("Render", "encode") == "Render: writing the video 50 %"
     assert told("Explanation", "track") == "Explanation: tracking 50 %"
+
+
+def test_a_photo_that_blenders_eevee_shows_without_shadows_is_said_to_have_none(tmp_path):
+    a_body()
+    scene = bpy.context.scene
+    said = {}
+    for engine in (compat.eevee(), "CYCLES"):
+        scene.render.engine = engine
+        for folder in ("", str(tmp_path)):
+            scene.physgen.folder = folder
+            said[engine, folder] = "no shadows on the ground" in " ".join(draw_all()["PHYSGEN_PT_render"].words)
+    assert [key for key, is_said in said.items() if is_said] == [(compat.eevee(), str(tmp_path))]
 
 
 def test_a_bake_is_paused_and_other_jobs_are_cancelled():
