@@ -34,7 +34,7 @@ from ..memory import COMPOSITION_RESERVED, available_memory, composition_bytes, 
 from ..mpm.colliders import Surface
 from ..mpm.geometry.triangles import face_normals
 from ..scene.folder import Scene, inside, referenced_files, save_scene, unchanged_scene
-from ..scene.model import SceneModel, SceneObject
+from ..scene.model import Ground, SceneModel, SceneObject
 from ..scene.scene_output import COMPOSE_FILE, PHYSICS_FILE, replacing_folder
 from ..scene.textured_mesh import moved_suffix, transformed, write_moved_mesh
 from ..version import VERSION
@@ -325,11 +325,7 @@ def _compose_group(
     # The slab was for the optimiser only.
     composed = dataclasses.replace(composed, parts=(parts[0], *map(_with_closed_seams, parts[1:], composed.parts[1:])))
     after = _penetrations(composed.parts)
-    late = list(composed.notes)
-    for old, new in zip(parts[1:], composed.parts[1:], strict=True):
-        deeper = depth_below_ground(ground, new.surface) - depth_below_ground(ground, old.surface)
-        if deeper > 1e-3 * float(np.ptp(new.surface.vertices, axis=0).max()):
-            late.append(f"object {new.name!r}: reaches {length(deeper)} further into the ground than before")
+    late = [*composed.notes, *_sunk_deeper(ground, parts[1:], composed.parts[1:])]
     for note in late:
         on_event({"event": "notice", "stage": STAGE, "message": note})
     alike = None
@@ -348,6 +344,16 @@ def _compose_group(
         ),
         notes=(*notes, *late),
     )
+
+
+def _sunk_deeper(
+    ground: Ground | None, before: Sequence[CompositionPart], after: Sequence[CompositionPart]
+) -> Iterator[str]:
+    """Yield a note for each part that reaches clearly further into the ground ``after`` than ``before``."""
+    for old, new in zip(before, after, strict=True):
+        deeper = depth_below_ground(ground, new.surface) - depth_below_ground(ground, old.surface)
+        if deeper > 1e-3 * float(np.ptp(new.surface.vertices, axis=0).max()):
+            yield f"object {new.name!r}: reaches {length(deeper)} further into the ground than before"
 
 
 def _with_closed_seams(before: CompositionPart, after: CompositionPart) -> CompositionPart:

@@ -202,19 +202,13 @@ def evaluate(
                 recordings = [open_footage(Path(other)) for other in against]
                 sections.append(against_section(footage, recordings, most))
             progress.report(1)
-            flow = dis_flow() if options.flow is None else network_flow(options.flow)
-            named = "DIS" if options.flow is None else options.flow.name
-            still = None if photo is None else Path(photo)
-            sections.append(
-                without_reference(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled)
-            )
+            sections.append(_by_itself(footage, most, photo, options, cancelled))
             strip = strip_frames(footage, most)
             if judge is not None:
                 section, judgement = judged(footage, most, judge, notice=progress.notice, cancelled=cancelled)
                 sections.append(section)
-                tables[JUDGE_FILE] = json.dumps(judgement.to_json(), indent=1, ensure_ascii=False).encode(
-                    "utf-8", "replace"
-                )
+                text = json.dumps(judgement.to_json(), indent=1, ensure_ascii=False)
+                tables[JUDGE_FILE] = text.encode("utf-8", "replace")
         if cancelled():
             raise Cancelled("the evaluation was cancelled; nothing was written")
         progress.report(2)
@@ -223,14 +217,28 @@ def evaluate(
             subject = subject or baked.root.resolve().name
             sections.append(bake_physics(baked, _scene_of(baked, scene), cancelled=cancelled))
         found = Evaluation(root=out, subject=subject, sections=tuple(sections))
-        # Those of a judge were said as they came.
-        said = {notice for section in sections if section.name == JUDGE for notice in section.notices}
-        for notice in found.notices:
-            if notice not in said:
-                progress.notice(notice)
+        _tell(found, progress)
         save(found, out, strip, tables)
         progress.report(3)
         return found
+
+
+def _by_itself(
+    footage: Footage, most: int, photo: str | Path | None, options: EvaluateOptions, cancelled: IsCancelled
+) -> Section:
+    """Return what ``footage``, of at most ``most`` frames, shows without a recording to compare it with."""
+    flow = dis_flow() if options.flow is None else network_flow(options.flow)
+    named = "DIS" if options.flow is None else options.flow.name
+    still = None if photo is None else Path(photo)
+    return without_reference(footage, most, photo=still, flow=flow, flow_name=named, cancelled=cancelled)
+
+
+def _tell(found: Evaluation, progress: StageProgress) -> None:
+    """Say the notices of ``found``; those of a judge were said as they came."""
+    said = {notice for section in found.sections if section.name == JUDGE for notice in section.notices}
+    for notice in found.notices:
+        if notice not in said:
+            progress.notice(notice)
 
 
 VIEWS_FILE = "physics_iq.csv"

@@ -127,32 +127,35 @@ def explain(
         write_diagnosis(diagnosis, partial / DIAGNOSIS_FOLDER)
         write_report(diagnosis, capture, partial / DIAGNOSIS_FOLDER)
         _compare(trial, motion, diagnosis, partial / VIDEO_FILE, on_event)
-        gap = diagnosis.gap
-        closed = gap.closed_fraction if diagnosis.verdict.effect != NONE else math.nan
-        write_json(
-            partial / EXPLAIN_FILE,
-            {
-                "format": FORMAT,
-                "video": trial.path.name,
-                "setting": motion.view.kind,
-                "frames": [int(motion.frames[0]), int(motion.frames[-1])],
-                "pixels_per_metre": round(motion.view.scale, 3),
-                "effect": diagnosis.verdict.effect,
-                "probability": diagnosis.verdict.probability,
-                "closed_fraction": closed if math.isfinite(closed) else None,
-                "before_rms_m": gap.before_rms_m,
-                "after_rms_m": gap.after_rms_m,
-                "notes": notes,
-            },
+        closed = diagnosis.gap.closed_fraction if diagnosis.verdict.effect != NONE else math.nan
+        found = Explanation(
+            diagnosis=diagnosis,
+            root=out,
+            video=out / VIDEO_FILE,
+            setting=motion.view.kind,
+            closed=closed,
+            notes=tuple(notes),
         )
-    return Explanation(
-        diagnosis=diagnosis,
-        root=out,
-        video=out / VIDEO_FILE,
-        setting=motion.view.kind,
-        closed=closed,
-        notes=tuple(notes),
-    )
+        write_json(partial / EXPLAIN_FILE, _record(found, trial, motion))
+    return found
+
+
+def _record(found: Explanation, trial: VideoTrial, motion: VideoMotion) -> dict[str, Any]:
+    """Return what ``explain.json`` says."""
+    verdict, gap = found.diagnosis.verdict, found.diagnosis.gap
+    return {
+        "format": FORMAT,
+        "video": trial.path.name,
+        "setting": found.setting,
+        "frames": [int(motion.frames[0]), int(motion.frames[-1])],
+        "pixels_per_metre": round(motion.view.scale, 3),
+        "effect": verdict.effect,
+        "probability": verdict.probability,
+        "closed_fraction": found.closed if math.isfinite(found.closed) else None,
+        "before_rms_m": gap.before_rms_m,
+        "after_rms_m": gap.after_rms_m,
+        "notes": list(found.notes),
+    }
 
 
 def title_of_cause(diagnosis: Diagnosis) -> str:

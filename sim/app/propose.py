@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..atomic import write_bytes, write_json
 from ..errors import InputError
@@ -16,6 +17,9 @@ from ..reconstruct.reconstruct_options import WITHOUT, Proposal
 from ..scene.folder import file_hash
 from ..trust import trusted_spec
 from ..validation import parse, read_json, to_json
+
+if TYPE_CHECKING:
+    from ..reconstruct.photo import Photo
 
 FORMAT = "physgen-proposals/1"
 LIST_FILE, PICTURE_FILE = "proposals.json", "proposals.jpg"
@@ -79,12 +83,9 @@ def propose(
         if earlier is not None:
             return earlier
     # The pipeline's modules cost a second of imports that an up-to-date list does not need, and Blender has no Pillow.
-    from PIL import Image
-
     from ..reconstruct.adapters.protocols import SoftSegmenter
     from ..reconstruct.adapters.resolve import resolve
     from ..reconstruct.photo import load_photo
-    from ..reconstruct.report_pictures import numbered_boxes
     from ..reconstruct.segmentation.object_proposals import proposals_from_alpha, propose_boxes, with_model
     from ..reconstruct.stage_cache import Steps
 
@@ -105,10 +106,6 @@ def propose(
         raise InputError(f"{photo}: no object stands out in it; draw a box around each one (--box x0,y0,x1,y1)")
     steps.finish()
     if out is not None:
-        boxes = [tuple(v * picture.scale for v in item.box) for item in found]
-        file = io.BytesIO()
-        shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
-        Image.fromarray(shown).save(file, format="JPEG", quality=90)
         width, height = picture.original_size
         record = ProposalRecord(
             photo=str(photo.resolve()),
@@ -118,8 +115,21 @@ def propose(
             height=height,
             proposals=found,
         )
-        _write(Path(out), record, file.getvalue())
+        _write(Path(out), record, _numbered_picture(picture, found))
     return found
+
+
+def _numbered_picture(picture: Photo, found: Sequence[Proposal]) -> bytes:
+    """Return a JPEG file of the photo as it was searched, with the numbers of what was ``found``."""
+    from PIL import Image
+
+    from ..reconstruct.report_pictures import numbered_boxes
+
+    boxes = [tuple(v * picture.scale for v in item.box) for item in found]
+    file = io.BytesIO()
+    shown = numbered_boxes(picture.pixels, boxes, best_proposals(found))
+    Image.fromarray(shown).save(file, format="JPEG", quality=90)
+    return file.getvalue()
 
 
 def _earlier(folder: Path, content: str, segmenter: str) -> tuple[Proposal, ...] | None:

@@ -238,13 +238,7 @@ def collect_questionnaire(
     sheets, notes = _sheets([Path(path) for path in answers], known)
     cases = known["cases"]
     videos = list(dict.fromkeys(name for case in cases for name in case["videos"].values()))
-    # People, cases, videos, criteria.
-    table = np.full((len(sheets), len(cases), len(videos), len(CRITERIA)), np.nan)
-    for i, sheet in enumerate(sheets):
-        for j, case in enumerate(cases):
-            for token, video in case["videos"].items():
-                for criterion, value in sheet.scores[case["id"]][token].items():
-                    table[i, j, videos.index(video), CRITERIA.index(criterion)] = value
+    table = _score_table(sheets, cases, videos)
     for many, what in ((len(sheets), "person"), (len(cases), "case")):
         if many == 1:
             notes.append(f"only one {what}: the intervals say nothing of how another {what} would differ")
@@ -276,6 +270,17 @@ def collect_questionnaire(
 
 
 LEVELS = ("ordinal", "interval")
+
+
+def _score_table(sheets: Sequence[Sheet], cases: Sequence[dict[str, Any]], videos: Sequence[str]) -> Array:
+    """Return the scores by person, case, video and criterion; NaN where there is none."""
+    table = np.full((len(sheets), len(cases), len(videos), len(CRITERIA)), np.nan)
+    for i, sheet in enumerate(sheets):
+        for j, case in enumerate(cases):
+            for token, video in case["videos"].items():
+                for criterion, value in sheet.scores[case["id"]][token].items():
+                    table[i, j, videos.index(video), CRITERIA.index(criterion)] = value
+    return table
 
 
 def _units(table: Array, criterion: int) -> Array:

@@ -8,7 +8,8 @@ import pytest
 import trimesh
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 from physgen.sim.reconstruct.lighting.ground_lighting import MAX_SHARE
-from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps, ground_axes
+from physgen.sim.reconstruct.lighting.ground_observation import ground_axes
+from physgen.sim.reconstruct.lighting.lamps import LampEstimate, estimate_lamps
 from physgen.sim.reconstruct.lighting.light_estimate import KEY_SHARE, KEY_SPREAD, with_soft_key, with_spots
 from physgen.sim.reconstruct.lighting.standing_surface import ground_before, standing_surface
 from physgen.sim.scene.environment import ground_light, lamps_in

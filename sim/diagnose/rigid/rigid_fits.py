@@ -162,36 +162,41 @@ def fit_rigid(
     whole = work.limit
     for number, body in enumerate(bodies):
         work.limit = whole * (number + 1) / len(bodies)
-        fit_nominal(body)
-        tick("nominal")
-        for candidate in wanted:
-            if work.left():
-                begin_search(body, (candidate,))
-                if candidate.name == "camera_pose":
-                    fit_camera_pose(body)
-            else:
-                work.skip((candidate.name,), "tried")
-            tick(candidate.name)
-        finish_best(body)
-        refit_beliefs(body)
-        tick("refitted")
-        refit_best(body)
-        settle_on_a_face(body)
-        refine_promising(body)
-        reconsider_nominal(body)
-        tick("best again")
-        search_pairs(body, wanted)
-        for _ in range(SHARPENINGS):
-            if not sharpen(body):
-                break
-            # Sharper noise may leave room for a second effect.
-            search_pairs(body, wanted)
-        if body.problem.scene.unscaled:
-            body.fits = {k: share_spins(f) if "magnus" in k else f for k, f in body.fits.items()}
-        tick("pairs")
+        _fit_body(body, wanted, work, tick)
     fits = _assemble(capture, bodies)
     tick("judged")
     return fits
+
+
+def _fit_body(body: BodyFits, wanted: list[CandidateEffect], work: Work, tick: Callable[[str], None]) -> None:
+    """Fit the nominal model, the effects ``wanted`` and pairs of them to ``body``; tick: called after each step."""
+    fit_nominal(body)
+    tick("nominal")
+    for candidate in wanted:
+        if work.left():
+            begin_search(body, (candidate,))
+            if candidate.name == "camera_pose":
+                fit_camera_pose(body)
+        else:
+            work.skip((candidate.name,), "tried")
+        tick(candidate.name)
+    finish_best(body)
+    refit_beliefs(body)
+    tick("refitted")
+    refit_best(body)
+    settle_on_a_face(body)
+    refine_promising(body)
+    reconsider_nominal(body)
+    tick("best again")
+    search_pairs(body, wanted)
+    for _ in range(SHARPENINGS):
+        if not sharpen(body):
+            break
+        # Sharper noise may leave room for a second effect.
+        search_pairs(body, wanted)
+    if body.problem.scene.unscaled:
+        body.fits = {k: share_spins(f) if "magnus" in k else f for k, f in body.fits.items()}
+    tick("pairs")
 
 
 def _wanted(capture: Capture, names: Sequence[str] | None) -> list[CandidateEffect]:

@@ -224,8 +224,31 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
 
     size: half the body's width in m; middle: (3,) centre of the motion.
     """
-    e, mu = base.modulus, base.friction
-    pairs: Mapping[str, tuple[Candidate, ...]] = {
+    return {
+        **_of_matter(base.modulus),
+        **_of_contact(base.friction),
+        **_of_forces(middle),
+        "time_scale": (
+            _make("time_scale", lambda f: {"rate": math.exp(f[0])}, [0.0], [0.1], [1e-3], [[0.0]], [-1.0], [1.0]),
+        ),
+        "mass_offset": (
+            _make(
+                "mass_offset",
+                lambda f: {"fraction": PELLET, "offset_x": f[0], "offset_y": f[1], "offset_z": f[2]},
+                [0.0] * 3,
+                [0.3 * size] * 3,
+                [1e-3 * size] * 3,
+                [[0.0, 0.0, 0.0]],
+                [-0.8 * size] * 3,
+                [0.8 * size] * 3,
+            ),
+        ),
+    }
+
+
+def _of_matter(e: float) -> dict[str, tuple[Candidate, ...]]:
+    """Return the candidates that change the matter, of Young's modulus ``e`` in Pa."""
+    return {
         "stiffness": (_one("stiffness", "factor", 1.0, 0.8, STIFFNESSES, most=12.0, weak=[1.0]),),
         "internal_damping": (
             _one("internal_damping", "damping_time", 4e-4, 1.2, [1e-4, 3e-4], most=2e-3, weak=[5e-5]),
@@ -243,6 +266,12 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
         ),
         "anisotropy": tuple(_fibres(e, axis) for axis in np.eye(3)),
         "stiffness_gradient": (_gradient(),),
+    }
+
+
+def _of_contact(mu: float) -> dict[str, tuple[Candidate, ...]]:
+    """Return the candidates that change the contact with the ground, whose friction is believed to be ``mu``."""
+    return {
         "friction": (
             _one("friction", "friction", max(mu, 0.02), 0.8, [0.4 * mu + 0.01, 1.8 * mu + 0.02], most=5.0, weak=[mu]),
         ),
@@ -259,6 +288,12 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
                 weak=[[math.log(10.0), math.log(5e-3)]],
             ),
         ),
+    }
+
+
+def _of_forces(middle: Array) -> dict[str, tuple[Candidate, ...]]:
+    """Return the candidates that pull or push the body. middle: (3,) centre of the motion."""
+    return {
         "air_drag": (_one("air_drag", "drag_per_mass", 0.1, 1.2, [0.1], most=20.0),),
         "wind": (
             _make(
@@ -287,23 +322,7 @@ def candidates(base: WorldParameters, size: float, middle: Array) -> dict[str, t
             ),
         ),
         "tether": tuple(_tether(middle, string) for string in (1.0, 0.0)),
-        "time_scale": (
-            _make("time_scale", lambda f: {"rate": math.exp(f[0])}, [0.0], [0.1], [1e-3], [[0.0]], [-1.0], [1.0]),
-        ),
-        "mass_offset": (
-            _make(
-                "mass_offset",
-                lambda f: {"fraction": PELLET, "offset_x": f[0], "offset_y": f[1], "offset_z": f[2]},
-                [0.0] * 3,
-                [0.3 * size] * 3,
-                [1e-3 * size] * 3,
-                [[0.0, 0.0, 0.0]],
-                [-0.8 * size] * 3,
-                [0.8 * size] * 3,
-            ),
-        ),
     }
-    return dict(pairs)
 
 
 def _fibres(modulus: float, axis: Array) -> Candidate:

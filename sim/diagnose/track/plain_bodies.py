@@ -82,7 +82,7 @@ def follow_plain_body(
     progress = StageProgress(on_event, STAGE, max(1, 2 * info.frames))
     found = _found_regions(video, max(1, 2 * info.frames), progress, cancelled)
     followed = _followed(video, body, found, info.fps)
-    regions, warnings = followed.regions, list(followed.warnings)
+    regions = followed.regions
     places = np.array([r.middle for r in regions]) / found.scale
     clock, missing = with_missing_frames(followed.times, places)
     length_px, length, elevation, misfit = apparent_size(regions, body, item, found.scale)
@@ -107,20 +107,13 @@ def follow_plain_body(
         if seen_so is not None:
             view, box, path_px, clock, missing = seen_so
             misfit = 0.0
-    if missing:
-        warnings.append(f"{missing} frames are missing in the file: the body jumps ahead and goes on as before")
-    if misfit > MISSHAPEN:
-        warnings.append(
-            f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
-            "its scale is rough"
-        )
     kept, free = _samples(path, regions, clock, view, box)
     points = view.points[kept - view.first]
     noise_of_centre = _centre_noise(body, view, clock[free], path_px[free], None if box is None else box.at(free))
     turns = None if box is None else box.turns[kept]
     trial, noise = _trial(path.stem, clock[kept], points, item, view, noise_of_centre, turns)
     capture = _capture(body, item, view, trial, noise)
-    for message in (*view.notes, *warnings):
+    for message in (*view.notes, *followed.warnings, *_doubts(body, missing, misfit)):
         progress.notice(f"{path.name}: {message}")
     return VideoMotion(
         capture=capture,
@@ -143,6 +136,19 @@ class _Followed:
     times: Array
     warnings: tuple[str, ...]
     others: tuple[tuple[Region, ...], ...]
+
+
+def _doubts(body: BodyRequest, missing: int, misfit: float) -> list[str]:
+    """Return warnings of ``missing`` frames, and of an outline that is off that of ``body`` by the share ``misfit``."""
+    said = []
+    if missing:
+        said.append(f"{missing} frames are missing in the file: the body jumps ahead and goes on as before")
+    if misfit > MISSHAPEN:
+        said.append(
+            f"what moves does not look like a {body.kind} of that shape (outline {100 * misfit:.0f} % off); "
+            "its scale is rough"
+        )
+    return said
 
 
 def _found_regions(video: VideoTrial, steps: int, progress: StageProgress, cancelled: IsCancelled) -> MovingRegions:

@@ -4,6 +4,7 @@
 shadow_masks.py        shadows of the objects; shadow_planes.py what they fall on, shadow_model.py the probability of
                        each pixel, shadow_lamps.py the lamps that explain them
 ground_pixels.py       the ground's colours; standing_surface.py which part of it the objects stand on
-light_estimate.py      environment and sun; lamps.py from shadows, ground_lighting.py their shares
+light_estimate.py      environment and sun; lamps.py from shadows, ground_observation.py the
+                       ground that shows these, ground_lighting.py their shares
 ground_gloss.py        mirror images of the objects; ground_roughness.py how blurred they are
 """

@@ -19,7 +19,8 @@ from ...scene.environment import SPOT_SHARE, ground_light, sun_in
 from ...scene.equirectangular import LUMINANCE, Radiance, directions
 from ...scene.model import Camera, Ground, Light, Vector
 from ...srgb import bytes_to_linear
-from .lamps import MOST_LAMPS, LampEstimate, Mask, Mesh, estimate_lamps, ground_axes
+from .ground_observation import Mask, Mesh, ground_axes
+from .lamps import MOST_LAMPS, LampEstimate, estimate_lamps
 
 SIZE = (64, 32)
 BLUR = 0.04
