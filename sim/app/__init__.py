@@ -9,7 +9,8 @@ add_drops.py           things that fall into a photo
 add_effect.py          effects that a diagnosis found, added to a scene
 scene_variant.py       the same scene with other physics
 set_light.py           another light
-compose_scene.py       objects brought to fit each other; compose_inputs.py what that needs
+compose_scene.py       objects brought to fit each other; compose_inputs.py what that needs,
+                       composition_folder.py what it writes
 default_motion.py      a motion for a scene at rest; motion_stage.py its moves (moves.py), free_space.py their room
 clip_check.py          warnings about a clip before it is rendered
 bake.py                scene folder → bake folder

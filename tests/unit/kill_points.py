@@ -165,7 +165,7 @@ def do_bake(folder):
 
 def do_compose(folder, by=0.01):
     """What a composition writes, over an earlier one; what it computes changes nothing on the disk."""
-    from physgen.sim.app.compose_scene import MovedObject, composition_folder, write_composition
+    from physgen.sim.app.composition_folder import MovedObject, composition_folder, write_composition
 
     scene = load_scene(folder / "pair")
     mesh = load_object_mesh(scene, scene.objects[0])

@@ -14,7 +14,7 @@ import pytest
 from physgen.batch import cli, stages
 from physgen.sim.app import set_light
 from physgen.sim.app.add_drops import Drop, add_drops
-from physgen.sim.app.compose_scene import composition_folder
+from physgen.sim.app.composition_folder import composition_folder
 from physgen.sim.app.default_motion import DefaultMotion
 from physgen.sim.app.export_usd import export_usd
 from physgen.sim.app.moves import Move
