@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from ...errors import InputError
 from .hidden_legs import with_hidden_legs
+from .hidden_solids import box, round_body
 from .mask_geometry import Mask, grown
 from .outline_guesses import OutlineGuess, continued, ellipse, known_share, mirrored, point_mirrored
 
@@ -26,6 +27,8 @@ COINCIDENCE = 0.1
 """Cost of an outline that follows the occluder's border everywhere, in shares of the visible area."""
 PREFERENCE = {
     "ellipse": -0.03,
+    "box": -0.01,
+    "round_body": 0.0,
     "legs": 0.0,
     "mirrored": 0.02,
     "point_mirrored": 0.03,
@@ -77,7 +80,7 @@ def _guesses(seen: Mask, unknown: Mask, lowest_base: float) -> list[OutlineGuess
     standing = with_hidden_legs(seen, unknown, lowest_base)
     if standing is not None:
         guesses.append(OutlineGuess("legs", standing, 0.0))
-    for rule in (ellipse, mirrored, point_mirrored):
+    for rule in (ellipse, box, round_body, mirrored, point_mirrored):
         guess = rule(seen, unknown)
         if guess is not None:
             guesses.append(guess)

@@ -46,8 +46,8 @@ def _convolved(first: NDArray[Any], second: NDArray[Any], *, axes: int | None = 
 
 def ellipse(seen: Mask, unknown: Mask) -> OutlineGuess | None:
     """Fit an ellipse to the object's own outline (Fitzgibbon, Pilu & Fisher, PAMI 1999)."""
-    contour = _contour(seen)
-    own = contour[_own(contour, unknown)]
+    contour = contour_of(seen)
+    own = contour[on_own_edge(contour, unknown)]
     if len(own) < 12:
         return None
     (x, y), (width, height), turn = cv2.fitEllipseDirect(own.astype(np.float32))
@@ -110,8 +110,8 @@ def continued(seen: Mask, unknown: Mask, lowest_base: float) -> OutlineGuess:
     Tangents that meet are joined by a conic. Parallel ones, such as the walls of a bottle whose foot is hidden, are
     extended: down to the row ``lowest_base``, sideways half as far as the object could reach unseen.
     """
-    contour = _contour(seen)
-    own = _own(contour, unknown)
+    contour = contour_of(seen)
+    own = on_own_edge(contour, unknown)
     reach = max(5, round(0.08 * len(contour)))
     result = seen.copy()
     for first, last in _cut_runs(own):
@@ -205,8 +205,12 @@ def known_share(wrong: Mask, seen: Mask, unknown: Mask) -> float:
 
 
 def _hull(mask: Mask) -> Mask:
-    points = np.argwhere(mask)[:, ::-1].astype(np.float32)
-    return _filled_polygon(cv2.convexHull(points)[:, 0].astype(np.float64), mask.shape)
+    return filled_hull(np.argwhere(mask)[:, ::-1].astype(np.float64), mask.shape)
+
+
+def filled_hull(points: Points, shape: tuple[int, ...]) -> Mask:
+    """Return the convex hull of ``points`` (n, 2) as a mask of ``shape``."""
+    return _filled_polygon(cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64), shape)
 
 
 def _filled_polygon(polygon: Points, shape: tuple[int, ...]) -> Mask:
@@ -215,13 +219,14 @@ def _filled_polygon(polygon: Points, shape: tuple[int, ...]) -> Mask:
     return np.asarray(drawn > 0)
 
 
-def _contour(mask: Mask) -> Points:
+def contour_of(mask: Mask) -> Points:
+    """Return the points (n, 2) of the longest outer contour of ``mask`` (h, w), in order."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(max(contours, key=len)[:, 0, :], dtype=np.float64)
 
 
-def _own(contour: Points, unknown: Mask) -> Mask:
-    """Points (bool) of ``contour`` on the object's own edge: those away from possible occluders."""
+def on_own_edge(contour: Points, unknown: Mask) -> Mask:
+    """Return which points (n,) of ``contour`` are on the object's own edge: those away from possible occluders."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     near = cv2.dilate(unknown.astype(np.uint8), kernel) > 0
     return np.asarray(~near[contour[:, 1].astype(int), contour[:, 0].astype(int)])
