@@ -18,7 +18,8 @@ from ...composite.inpaint import FillOptions, hole_parts
 from ...errors import InputError
 from ...scene.model import Camera
 from ..segmentation.plain_backdrop import plain_backdrop
-from .inpainting_methods import BY_STRETCHES, METHODS, InpaintingTask, box
+from .inpainting_methods import AS_LATTICE, BY_STRETCHES, METHODS, InpaintingTask, box
+from .lattice_pattern import Lattice, find_lattice
 from .method_choice import MethodChoice, choose_method
 from .relit_ground import continued, near_any, relit, smoothed
 from .surface_edges import Edge, edges_behind
@@ -177,6 +178,8 @@ BACKDROP, BACKDROP_RIM = 0.9, (8.0, 28.0)
 how far beside it, in pixels at 1024: nearer lie the blurred outlines of what stands there."""
 SMALL = 2e-4
 """Share of the photo below which a part uses the default method without a trial."""
+REPEATED = 5e-3
+"""Share of the photo from which a lattice is looked for: that takes about three seconds of CPU time."""
 SPECK = 0.02
 """Share of a surface's part of the hole below which pieces of it are inpainted together."""
 GUESSED = 1.0
@@ -286,11 +289,14 @@ def _fill_part(
     barred = barred | dark
     for side, ground in _sides(edges, part.shape):
         target = part & side
-        if ground:
-            closed = barred | (open_hole & ~part) | ~side
-            filling[...], target = relit(filling, target, closed, objects, changed)
         others = barred | (open_hole & ~part) | ~side
-        _fill_surface(filling, target, others, objects, ground, camera, options, notice)
+        lattice = None
+        if ground and target.sum() > REPEATED * target.size:
+            lattice = find_lattice(logarithms(filling), target, others, camera)
+        if ground and lattice is None:
+            # A pattern that repeats is known better than what is left of it in shadow.
+            filling[...], target = relit(filling, target, others, objects, changed)
+        _fill_surface(filling, target, others, objects, ground, camera, options, notice, lattice)
     _soften(filling, part, edges)
 
 
@@ -303,6 +309,7 @@ def _fill_surface(
     camera: Camera,
     options: FillOptions,
     notice: Notice,
+    lattice: Lattice | None,
 ) -> None:
     """Inpaint ``target`` of one surface in ``filling``, in place, piece by piece, each at the level of its border."""
     pieces = _pieces(target)
@@ -311,7 +318,9 @@ def _fill_surface(
     # Surfaces beyond the ground's far border never use the top view.
     ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
     largest = pieces[-1]
-    task = InpaintingTask(filling, largest, closed | (target & ~largest), camera, options)
+    task = InpaintingTask(filling, largest, closed | (target & ~largest), camera, options, lattice)
+    if lattice is not None:
+        ways = (*ways, AS_LATTICE)
     choice = MethodChoice(PHOTO_WAYS[0], {}, np.inf)
     if largest.sum() > SMALL * largest.size:
         choice = choose_method(task, ways)
@@ -326,7 +335,7 @@ def _fill_surface(
     left = target
     for piece in pieces:
         left = left & ~piece
-        task = InpaintingTask(filling, piece, closed | left, camera, options)
+        task = InpaintingTask(filling, piece, closed | left, camera, options, lattice)
         filled = METHODS[choice.way](task)
         filled += _lead(filling, filled, piece, objects | closed | left, max(piece.shape) / 1024.0)
         filling[piece] = np.clip(filled, 0.0, 255.0)[piece]

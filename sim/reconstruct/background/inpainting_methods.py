@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Methods of inpainting one part of a hole: in the photo, by rows, as a surface, by stretches, from above.
+"""Methods of inpainting one part of a hole: by rows, as a surface, by stretches, from above, as a lattice.
 
 Which one is used is a matter of trial (``method_choice``).
 """
@@ -7,7 +7,7 @@ Which one is used is a matter of trial (``method_choice``).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...composite.inpaint import FillOptions, inpaint_once
 from ...robust_deviation import robust_deviation
 from ...scene.model import Camera
+from .lattice_pattern import ENOUGH, Lattice
 from .relit_ground import near_any, smoothed
 from .stretch_inpainting import fill_stretches, is_even
 from .surface_inpainting import clamp_to_surroundings, fill_surface, light_field, logarithms
@@ -153,6 +154,7 @@ class InpaintingTask:
     closed: Mask
     camera: Camera
     options: FillOptions
+    lattice: Lattice | None = None
 
 
 Method = Callable[[InpaintingTask], Picture]
@@ -198,6 +200,37 @@ def as_ground(task: InpaintingTask) -> Picture:
     if left.any():
         return by_rows(InpaintingTask(result, left, task.closed, task.camera, task.options))
     return result
+
+
+def as_lattice(task: InpaintingTask) -> Picture:
+    """Return the picture with the pattern of ``task.lattice`` continued; by rows where there is none, or where what it
+    repeats is seen nowhere."""
+    if task.lattice is None:
+        return by_rows(task)
+    rows, columns = around(task)
+    hole, barred = task.target[rows, columns], task.closed[rows, columns] & ~task.target[rows, columns]
+    known = ~(hole | barred)
+    if known.mean() < MIN_KNOWN:
+        return by_rows(task)
+    piece = np.ascontiguousarray(task.picture[rows, columns])
+    logs = logarithms(piece)
+    slow, lack = light_field(logs, known, hole)
+    pattern = np.where(known[..., None], logs - slow - lack, 0.0).astype(np.float32)
+    y, x = np.nonzero(hole)
+    lattice = task.lattice.moved(columns.start, rows.start)
+    found, weights = lattice.foretold(pattern, known, np.stack([x, y], axis=1).astype(np.float64) + 0.5)
+    told = weights > ENOUGH
+    new = piece.copy()
+    new[y[told], x[told]] = np.exp(slow[y[told], x[told]] + found[told])
+    left = np.zeros_like(hole)
+    left[y[~told], x[~told]] = True
+    result = task.picture.copy()
+    result[rows, columns][hole & ~left] = new[hole & ~left]
+    if not left.any():
+        return result
+    rest = np.zeros_like(task.target)
+    rest[rows, columns] = left
+    return by_rows(replace(task, picture=result, target=rest))
 
 
 def around(task: InpaintingTask) -> tuple[slice, slice]:
@@ -257,11 +290,12 @@ def box(mask: Mask, margin: int) -> tuple[slice, slice]:
     )
 
 
-BY_STRETCHES = "by stretches"
+BY_STRETCHES, AS_LATTICE = "by stretches", "as a lattice"
 METHODS: dict[str, Method] = {
     "by rows": by_rows,
     "by rows without light": by_rows_without_light,
     "as a surface": as_surface,
     BY_STRETCHES: by_stretches,
     "as ground": as_ground,
+    AS_LATTICE: as_lattice,
 }

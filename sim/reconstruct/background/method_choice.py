@@ -158,6 +158,7 @@ def _smaller(task: InpaintingTask) -> InpaintingTask:
         picture=np.asarray(cv2.resize(task.picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32),
         target=np.asarray(target),
         closed=np.asarray(closed & ~target),
+        lattice=None if task.lattice is None else task.lattice.scaled(across, down),
         camera=replace(
             camera,
             width=size[0],
