@@ -13,5 +13,6 @@ ground_shade.py        ground that a mask has taken; reflected_colour.py with th
 strokes.py             the user's strokes
 mask_cleanup.py        specks and steps; matting.py alpha, mask_geometry.py parts and extent, mask_notices.py doubts
 occlusion_order.py     who is in front
-amodal_completion.py   hidden parts; outline_guesses.py guesses of the whole outline, hidden_solids.py boxes and round bodies
+amodal_completion.py   hidden parts; outline_guesses.py guesses of the whole outline,
+                       hidden_solids.py boxes and round bodies
 """
