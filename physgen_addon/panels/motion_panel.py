@@ -138,11 +138,11 @@ class PHYSGEN_PT_pushes(DynamicPart, bpy.types.Panel):
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
-    def draw_header(self, context: bpy.types.Context) -> None:
-        """Draw their frames, which tell of a motion that is still to come, also while this is closed."""
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        """Draw their frames behind the title, to be seen while this is closed, too."""
         frames = sorted(push.frame for push in active_body(context).physgen.pushes)
         if frames:
-            self.layout.label(text=f"({', '.join(map(str, frames))})")
+            self.layout.label(text=f"at {', '.join(map(str, frames))}")
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the list and the active push."""

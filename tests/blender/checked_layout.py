@@ -165,7 +165,8 @@ def draw(panel: type, **changes: Any) -> CheckedLayout | None:
         return None
     layout = CheckedLayout()
     drawn = Drawn(panel, layout)
-    if any("draw_header" in vars(base) for base in panel.__mro__):
-        panel.draw_header(drawn, context)
+    for header in ("draw_header", "draw_header_preset"):
+        if any(header in vars(base) for base in panel.__mro__):
+            getattr(panel, header)(drawn, context)
     panel.draw(drawn, context)
     return layout

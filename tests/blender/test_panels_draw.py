@@ -207,6 +207,7 @@ def test_pushes_are_added_after_each_other_and_the_panel_shows_them():
     assert [(push.frame, *push.velocity) for push in body.pushes] == [(34, 0, 0, 2), (58, 0, 0, 2), (90, 0, 0, 2)]
     shown = draw_all("PT_pushes")["PHYSGEN_PT_pushes"]
     assert {"frame", "velocity", "physgen.remove_push"} <= set(shown.names)
+    assert "at 34, 58, 90" in shown.words
     assert f"{bpy.context.object.name} at frames 10, 34, 58 and 90" in bake_state.unbaked(scene)
     body.push_index = 1
     assert bpy.ops.physgen.remove_push() == {"FINISHED"} and [push.frame for push in body.pushes] == [34, 90]
