@@ -30,6 +30,9 @@ def floor(kind, pitch, turn=17.0):
             dark = np.hypot((x / 0.14) % 1.0 - 0.5, (y / 0.14) % 1.0 - 0.5) < 0.28
         elif kind == "checks":
             dark = (np.floor(x / 0.13) + np.floor(y / 0.13)) % 2 == 0
+        elif kind == "tiles":
+            dark = (x / 0.15) % 1.0 < 0.07
+            dark |= (y / 0.15) % 1.0 < 0.07
         else:
             rng = np.random.default_rng(5)
             noise = cv2.GaussianBlur(rng.normal(size=(700, 700)).astype(np.float32), (0, 0), 6.0)
@@ -51,7 +54,7 @@ def error(plate, photo, where):
     return float(np.sqrt(np.square(plate[where].astype(float) - photo[where]).mean()))
 
 
-@pytest.mark.parametrize("kind", ["dots", "checks"])
+@pytest.mark.parametrize("kind", ["dots", "checks", "tiles"])
 @pytest.mark.parametrize("off", [-9.0, 8.0])
 def test_the_pattern_goes_on_behind_the_object_under_a_camera_that_is_off(kind, off):
     photo, where = floor(kind, 42.0), hole()

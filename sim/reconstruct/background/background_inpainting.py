@@ -19,7 +19,7 @@ from ...errors import InputError
 from ...scene.model import Camera
 from ..segmentation.plain_backdrop import plain_backdrop
 from .inpainting_methods import AS_LATTICE, BY_STRETCHES, METHODS, InpaintingTask, box
-from .lattice_pattern import Lattice, find_lattice
+from .lattice_pattern import Lattice, find_lattice, goes_on
 from .method_choice import MethodChoice, choose_method
 from .relit_ground import continued, near_any, relit, smoothed
 from .surface_edges import Edge, edges_behind
@@ -287,12 +287,16 @@ def _fill_part(
     covered = _widened(objects & open_hole, max(1, round(BESIDE * max(part.shape) / 1024))) | barred
     edges = edges_behind(logarithms(filling), part, covered, open_hole | dark)
     barred = barred | dark
+    logs, rest, lattice = logarithms(filling), barred | (open_hole & ~part), None
+    if part.sum() > REPEATED * part.size:
+        lattice = find_lattice(logs, part, rest, camera)
+    if lattice is not None:
+        # Joints are straight edges, too.
+        edges = [edge for edge in edges if not goes_on(lattice, logs, part, rest, camera, ~edge.below(part.shape))]
     for side, ground in _sides(edges, part.shape):
-        target = part & side
-        others = barred | (open_hole & ~part) | ~side
-        lattice = None
-        if ground and target.sum() > REPEATED * target.size:
-            lattice = find_lattice(logarithms(filling), target, others, camera)
+        target, others = part & side, rest | ~side
+        if ground and lattice is None and edges and target.sum() > REPEATED * target.size:
+            lattice = find_lattice(logs, target, others, camera)
         if ground and lattice is None:
             # A pattern that repeats is known better than what is left of it in shadow.
             filling[...], target = relit(filling, target, others, objects, changed)
@@ -319,7 +323,7 @@ def _fill_surface(
     ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
     largest = pieces[-1]
     task = InpaintingTask(filling, largest, closed | (target & ~largest), camera, options, lattice)
-    if lattice is not None:
+    if ground and lattice is not None:
         ways = (*ways, AS_LATTICE)
     choice = MethodChoice(PHOTO_WAYS[0], {}, np.inf)
     if largest.sum() > SMALL * largest.size:

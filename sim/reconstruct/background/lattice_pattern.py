@@ -52,6 +52,10 @@ SHARPER = 3.0
 """Power of the depths' ratio by which places farther away count less."""
 ENOUGH = 1e-3
 """Sum of weights below which nothing is foretold."""
+FEWEST = 100
+"""Places beyond an edge from which the pattern can be seen to go on there."""
+JOINT, BRIGHTEST = 7, 0.98
+"""Pixels of the copy up to which a dark line is a joint of tiles; share of the darkest that counts no more."""
 BESIDE, SAMPLES = 0.06, 2_500
 """Reach beside the hole over the longer side, and number of places there, at which the lattice is judged."""
 ROWS_AT_ONCE = 20_000
@@ -110,34 +114,83 @@ class Lattice:
         return np.asarray(total / np.maximum(weights, 1e-9)[:, None], dtype=np.float32), weights
 
 
+class _Copy:
+    """A copy of the photo in which a lattice is looked for, without its light: ``pattern`` (h, w, 3) where it is
+    ``known`` (h, w), and the ``hole`` (h, w)."""
+
+    def __init__(self, picture: Picture, target: Mask, closed: Mask, camera: Camera) -> None:
+        height, width = target.shape
+        scale = min(1.0, float(np.sqrt(PIXELS / target.size)))
+        self.size = (max(8, round(width * scale)), max(8, round(height * scale)))
+        self.across, self.down = self.size[0] / width, self.size[1] / height
+        logs = np.asarray(cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        self.hole, barred = (
+            cv2.resize(mask.astype(np.float32), self.size, interpolation=cv2.INTER_AREA) > 0.01
+            for mask in (target, closed)
+        )
+        self.ground = _Ground(camera, self.across, self.down)
+        self.region = self.ground.around(self.hole)
+        self.known = ~grown(self.hole | barred, 2) & self.region
+        slow, lack = light_field(logs, self.known, self.hole)
+        self.pattern = np.where(self.known[..., None], logs - slow - lack, 0.0).astype(np.float32)
+
+    def beside(self, among: Mask | None = None) -> NDArray[np.int64]:
+        """Return at most ``SAMPLES`` known places (n, 2) beside the hole, ``among`` (H, W) those of the photo."""
+        near = self.known & grown(self.hole, round(BESIDE * max(self.size)))
+        if among is not None:
+            near &= cv2.resize(among.astype(np.uint8), self.size, interpolation=cv2.INTER_NEAREST) > 0
+        places = np.argwhere(near)[:, ::-1]
+        return np.asarray(places[np.linspace(0, len(places) - 1, min(SAMPLES, len(places))).round().astype(int)])
+
+    def share(self, lattice: Lattice, places: NDArray[np.int64]) -> float:
+        """Return the share of the variance at ``places`` (n, 2) that ``lattice``, of this copy, foretells: at most 1, 0
+        where it foretells less than half of them."""
+        truth = self.pattern[places[:, 1], places[:, 0]]
+        found, weights = lattice.foretold(self.pattern, self.known, places.astype(np.float64) + 0.5)
+        told = weights > ENOUGH
+        if told.sum() < max(1.0, 0.5 * len(places)):
+            return 0.0
+        spread = float(np.square(truth[told] - truth[told].mean(axis=0)).sum())
+        return 1.0 - float(np.square(truth[told] - found[told]).sum()) / max(spread, 1e-12)
+
+
 def find_lattice(picture: Picture, target: Mask, closed: Mask, camera: Camera) -> Lattice | None:
     """Return the lattice of the ground's pattern around ``target`` (H, W); None where it has none.
 
     picture: (H, W, 3) logarithms of light. closed: (H, W) other pixels that tell nothing: things, shadows, walls.
     camera: above the ground z = 0; only where its horizon is counts, and that is refined.
     """
-    height, width = target.shape
-    scale = min(1.0, float(np.sqrt(PIXELS / target.size)))
-    size = (max(8, round(width * scale)), max(8, round(height * scale)))
-    across, down = size[0] / width, size[1] / height
-    logs = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    hole, barred = (
-        cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01 for mask in (target, closed)
-    )
-    ground = _Ground(camera, across, down)
-    region = ground.around(hole)
-    known = ~grown(hole | barred, 2) & region
-    if known.sum() < SAMPLES:
+    copy = _Copy(picture, target, closed, camera)
+    if copy.known.sum() < SAMPLES:
         return None
-    slow, lack = light_field(logs, known, hole)
-    pattern = np.where(known[..., None], logs - slow - lack, 0.0).astype(np.float32)
-    places = np.asarray(np.argwhere(region)[::37, ::-1] + 0.5, dtype=np.float64)
-    found = _search(ground, np.asarray(pattern.mean(axis=2), dtype=np.float32), known, places)
+    places = np.asarray(np.argwhere(copy.region)[::37, ::-1] + 0.5, dtype=np.float64)
+    light = np.asarray(copy.pattern.mean(axis=2), dtype=np.float32)
+    found = _search(copy.ground, light, copy.known, places)
+    if found is None:
+        # Tiles may differ from each other more than from their joints.
+        found = _search(copy.ground, *_joints(light, copy.known), places)
     if found is None:
         return None
-    beside = np.argwhere(known & grown(hole, round(BESIDE * max(size))))[:, ::-1]
-    refined = _refined(found, ground, pattern, known, beside)
-    return refined.scaled(1.0 / across, 1.0 / down) if refined.share >= FORETOLD else None
+    refined = _refined(found, copy)
+    return refined.scaled(1.0 / copy.across, 1.0 / copy.down) if refined.share >= FORETOLD else None
+
+
+def goes_on(lattice: Lattice, picture: Picture, target: Mask, closed: Mask, camera: Camera, beyond: Mask) -> bool:
+    """Return whether the pattern goes on in ``beyond`` (H, W) beside ``target`` (H, W), which is then the same surface.
+    The others: as for ``find_lattice``."""
+    copy = _Copy(picture, target, closed, camera)
+    places = copy.beside(beyond)
+    return len(places) >= FEWEST and copy.share(lattice.scaled(copy.across, copy.down), places) >= FORETOLD
+
+
+def _joints(light: NDArray[np.float32], known: Mask) -> tuple[NDArray[np.float32], Mask]:
+    """How much darker thin lines of ``light`` (h, w) are than what is beside them, and where that is ``known``."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (JOINT, JOINT))
+    inner = cv2.erode(known.astype(np.uint8), kernel) > 0
+    dark = cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel) - light
+    most = float(np.quantile(dark[inner], BRIGHTEST)) if inner.any() else 0.0
+    soft = cv2.GaussianBlur(np.minimum(dark, most), (0, 0), JOINT / 6.0)
+    return np.asarray(soft, dtype=np.float32), np.asarray(inner)
 
 
 @dataclass(frozen=True)
@@ -321,28 +374,19 @@ def _score(correlation: NDArray[np.float32], middle: Values, vectors: Values) ->
     return on - max(off, 0.0)
 
 
-def _refined(start: _Turned, ground: _Ground, pattern: Picture, known: Mask, beside: NDArray[np.int64]) -> Lattice:
-    """The lattice refined by what it foretells at known places ``beside`` (n, 2) the hole."""
-    places = beside[np.linspace(0, len(beside) - 1, min(SAMPLES, len(beside))).round().astype(int)]
-    truth = pattern[places[:, 1], places[:, 0]]
+def _refined(start: _Turned, copy: _Copy) -> Lattice:
+    """The lattice refined by what it foretells at known places beside the hole of ``copy``."""
+    places = copy.beside()
     unit = np.array([0.005, 0.005, *np.full(4, 0.02 * np.linalg.norm(start.vectors[0]))])
 
     def lattice(change: Values) -> Lattice:
         turned, moved = start.turns + (change * unit)[:2], start.vectors + (change * unit)[2:].reshape(2, 2)
-        return Lattice(ground.photo_from_plane(turned), moved[0], moved[1])
-
-    def error(change: Values) -> float:
-        found, weights = lattice(change).foretold(pattern, known, places + 0.5)
-        told = weights > ENOUGH
-        if told.sum() < 0.5 * len(places):
-            return 1.0
-        spread = np.square(truth[told] - truth[told].mean(axis=0)).sum()
-        return float(np.square(truth[told] - found[told]).sum() / max(float(spread), 1e-12))
+        return Lattice(copy.ground.photo_from_plane(turned), moved[0], moved[1])
 
     found = optimize.minimize(
-        error,
+        lambda change: -copy.share(lattice(change), places),
         np.zeros(6),
         method="Nelder-Mead",
         options={"initial_simplex": np.vstack([np.zeros(6), np.eye(6)]), "maxfev": 90},
     )
-    return replace(lattice(np.asarray(found.x)), share=float(np.clip(1.0 - found.fun, 0.0, 1.0)))
+    return replace(lattice(np.asarray(found.x)), share=float(np.clip(-found.fun, 0.0, 1.0)))
