@@ -165,7 +165,7 @@ def test_the_cameras_frame_leaves_sidebar_and_toolbar_free():
     def framed(**widths):
         view = SimpleNamespace(view_camera_zoom=0.0, view_camera_offset=[0.0, 0.0])
         regions = [SimpleNamespace(type=kind, width=width) for kind, width in widths.items()]
-        context._leave_sidebar_free(view, SimpleNamespace(width=1000), SimpleNamespace(regions=regions))
+        context._leave_sidebar_free(view, 1000, SimpleNamespace(regions=regions))
         return view.view_camera_zoom, view.view_camera_offset[0]
 
     zoom, offset = framed(UI=250)

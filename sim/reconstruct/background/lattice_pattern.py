@@ -40,12 +40,14 @@ PITCHES, ROLLS = np.radians(np.arange(-20.0, 21.0, 4.0)), np.radians((-6.0, -3.0
 """Turns of the ground's normal that are tried, about the photo's horizontal and about the optical axis."""
 MOST = 12
 """Multiples of a vector at which the correlation is looked at."""
+REPEATS = 8
+"""Places, twice along either vector among them, at which a lattice has to be repeated."""
 LIKELY, CLEAR = 0.2, 0.5
 """Mean correlation at the lattice's vectors, less that half-way between them, from which turns are refined; and from
 which it is one. Floors with a lattice had 0.64 to 0.96 in the pictures of the benchmark; marble, where few vectors fit
 in, up to 0.67, boards and cloth 0.5."""
-FORETOLD = 0.5
-"""Share of the variance beside the hole that the lattice foretells, from which it is one: 0.67 to 0.94; marble 0.48."""
+FORETOLD = 0.55
+"""Share of the variance beside the hole that the lattice foretells, from which it is one: 0.6 to 0.98; marble 0.51."""
 REACH, NEAR = 6, 3.0
 """Multiples of both vectors from which a hidden place is foretold; spread of their weights, in multiples."""
 SHARPER = 3.0
@@ -361,9 +363,13 @@ def _fitted(correlation: NDArray[np.float32], middle: Values, vectors: Values) -
 
 
 def _score(correlation: NDArray[np.float32], middle: Values, vectors: Values) -> float:
+    """Mean ``correlation`` (h, w) at the multiples of ``vectors`` (2, 2) less that half-way between; 0 where either is
+    not repeated twice: along a single edge all is alike."""
     places = MULTIPLES @ vectors
-    places = places[_within(correlation, middle, places)]
-    if len(places) < 8:
+    within = _within(correlation, middle, places)
+    places = places[within]
+    multiples = np.abs(MULTIPLES[within])
+    if len(multiples) < REPEATS or (multiples.max(axis=0) < 2).any():
         return 0.0
     halves = np.concatenate([places + half for half in (*vectors / 2.0, vectors.mean(axis=0))])
     halves = halves[_within(correlation, middle, halves)]
