@@ -9,6 +9,7 @@ import pytest
 from physgen.sim.reconstruct.background.background_inpainting import fill_background
 from physgen.sim.reconstruct.background.lattice_pattern import Lattice, find_lattice
 from physgen.sim.reconstruct.background.surface_inpainting import logarithms
+from physgen.sim.reconstruct.background.unboxed_things import unboxed_things
 from physgen.sim.reconstruct.camera.ground_camera import camera_above_ground, on_ground
 
 WIDTH, HEIGHT, FOCAL, SAMPLES = 480, 360, 520.0, 3
@@ -28,6 +29,8 @@ def floor(kind, pitch, turn=17.0):
     with np.errstate(invalid="ignore"):
         if kind == "dots":
             dark = np.hypot((x / 0.14) % 1.0 - 0.5, (y / 0.14) % 1.0 - 0.5) < 0.28
+        elif kind == "large dots":
+            dark = np.hypot((x / 0.25) % 1.0 - 0.5, (y / 0.25) % 1.0 - 0.5) < 0.2
         elif kind == "checks":
             dark = (np.floor(x / 0.13) + np.floor(y / 0.13)) % 2 == 0
         elif kind == "tiles":
@@ -93,3 +96,15 @@ def test_places_that_repeat_nowhere_in_sight_are_not_foretold():
     far = Lattice(np.eye(3), np.array([1e5, 0.0]), np.array([0.0, 1e5]))
     values, weights = far.foretold(np.ones((9, 9, 3), np.float32), np.ones((9, 9), bool), np.array([[4.0, 4.0]]))
     assert (weights == 0.0).all() and np.isfinite(values).all()
+
+
+def test_dots_of_a_cloth_are_no_things_that_stay():
+    photo = floor("large dots", 42.0)
+    where = np.hypot(*(np.mgrid[:HEIGHT, :WIDTH] - np.array([190, 220])[:, None, None])) < 45
+    photo[where] = (150, 60, 40)
+    assert not unboxed_things(photo, [where], camera(33.0)).stay.any()
+    # What lies on the cloth does, though it hides some dots.
+    thing = np.hypot(*(np.mgrid[:HEIGHT, :WIDTH] - np.array([210, 370])[:, None, None])) < 42
+    photo[thing] = (40, 90, 170)
+    found = unboxed_things(photo, [where], camera(33.0))
+    assert (found.stay & thing).sum() > 0.9 * thing.sum()

@@ -144,6 +144,11 @@ class _Copy:
         places = np.argwhere(near)[:, ::-1]
         return np.asarray(places[np.linspace(0, len(places) - 1, min(SAMPLES, len(places))).round().astype(int)])
 
+    def within(self, among: Mask) -> NDArray[np.int64]:
+        """Return the known places (n, 2) ``among`` (H, W) those of the photo."""
+        small = cv2.resize(among.astype(np.uint8), self.size, interpolation=cv2.INTER_NEAREST) > 0
+        return np.asarray(np.argwhere(self.known & small)[:, ::-1])
+
     def share(self, lattice: Lattice, places: NDArray[np.int64]) -> float:
         """Return the share of the variance at ``places`` (n, 2) that ``lattice``, of this copy, foretells: at most 1, 0
         where it foretells less than half of them."""
@@ -183,6 +188,24 @@ def goes_on(lattice: Lattice, picture: Picture, target: Mask, closed: Mask, came
     copy = _Copy(picture, target, closed, camera)
     places = copy.beside(beyond)
     return len(places) >= FEWEST and copy.share(lattice.scaled(copy.across, copy.down), places) >= FORETOLD
+
+
+def repeated(picture: Picture, target: Mask, closed: Mask, camera: Camera, things: Mask) -> Mask:
+    """Return those of the connected ``things`` (H, W) that are marks of a pattern which repeats around ``target``.
+    The others: as for ``find_lattice``."""
+    result = np.zeros_like(things)
+    lattice = find_lattice(picture, target, closed, camera)
+    if lattice is None:
+        return result
+    copy = _Copy(picture, target, closed, camera)
+    small = lattice.scaled(copy.across, copy.down)
+    count, labels = cv2.connectedComponents(things.astype(np.uint8), connectivity=8)
+    for index in range(1, count):
+        # With what is around it: by itself it may be of one colour.
+        places = copy.within(grown(labels == index, max(2, round(0.005 * max(things.shape)))))
+        if len(places) and copy.share(small, places) >= FORETOLD:
+            result |= labels == index
+    return result
 
 
 def _joints(light: NDArray[np.float32], known: Mask) -> tuple[NDArray[np.float32], Mask]:

@@ -24,6 +24,8 @@ from ..camera.ground_camera import on_ground
 from ..segmentation.alike_blocks import blocks_of_a_kind
 from ..segmentation.mask_geometry import grown
 from ..segmentation.round_things import circles_of_a_kind
+from .lattice_pattern import repeated
+from .surface_inpainting import logarithms
 from .texture_prediction import predict_texture
 
 Mask = NDArray[np.bool_]
@@ -63,6 +65,8 @@ RIM, BOXED = 1.05, 0.3
 """Radius of a round thing of many over that of the circle that was found, which may be its rim's inner edge; and share
 of it that is an object's from which it is that object.
 """
+FEWEST = 3
+"""Things from which they may be a pattern that repeats."""
 HIDDEN = 0.1
 """Share of a thing's outline along an object above which the thing continues behind it."""
 MIRROR_OFF = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
@@ -96,11 +100,24 @@ def unboxed_things(pixels: NDArray[np.uint8], masks: Sequence[Mask], camera: Cam
     for mask in masks:
         if mask.any():
             _look_around(pixels, mask, objects, camera, stay, whole)
+    pattern = _pattern(pixels, objects, stay & ~objects, camera)
+    stay, whole = stay & ~pattern, whole & ~pattern
     if objects.any():
         alike = _alike(pixels, masks)
         stay |= alike
         whole |= alike
     return UnboxedThings(stay=stay & ~objects, whole=whole & ~objects)
+
+
+def _pattern(pixels: NDArray[np.uint8], objects: Mask, things: Mask, camera: Camera) -> Mask:
+    """Those of the ``things`` (H, W) on the ground that are a pattern, which repeats in two directions: dots, tiles."""
+    if int(cv2.connectedComponents(things.astype(np.uint8), connectivity=8)[0]) - 1 < FEWEST:
+        return np.zeros_like(things)
+    hole = grown(objects, max(2, round(0.01 * max(objects.shape))))
+    # Above them a wall may begin.
+    above = np.zeros_like(hole)
+    above[: np.flatnonzero(things.any(axis=1))[0]] = True
+    return repeated(logarithms(pixels.astype(np.float32)), hole, above & ~hole, camera, things)
 
 
 def _alike(pixels: NDArray[np.uint8], masks: Sequence[Mask]) -> Mask:
