@@ -297,11 +297,21 @@ def _fill_part(
         target, others = part & side, rest | ~side
         if ground and lattice is None and edges and target.sum() > REPEATED * target.size:
             lattice = find_lattice(logs, target, others, camera)
+        if ground and lattice is not None and not _is_best(filling, target, others, camera, options, lattice):
+            lattice = None
         if ground and lattice is None:
             # A pattern that repeats is known better than what is left of it in shadow.
             filling[...], target = relit(filling, target, others, objects, changed)
         _fill_surface(filling, target, others, objects, ground, camera, options, notice, lattice)
     _soften(filling, part, edges)
+
+
+def _is_best(
+    filling: Picture, target: Mask, closed: Mask, camera: Camera, options: FillOptions, lattice: Lattice
+) -> bool:
+    """Whether ``target`` (H, W) is filled best as a ``lattice``, by trial."""
+    task = InpaintingTask(filling, target, closed, camera, options, lattice)
+    return choose_method(task, (*PHOTO_WAYS, *GROUND_WAYS, AS_LATTICE)).way == AS_LATTICE
 
 
 def _fill_surface(
