@@ -108,3 +108,14 @@ def test_dots_of_a_cloth_are_no_things_that_stay():
     photo[thing] = (40, 90, 170)
     found = unboxed_things(photo, [where], camera(33.0))
     assert (found.stay & thing).sum() > 0.9 * thing.sum()
+
+
+@pytest.mark.parametrize("pitch", [90.0, 89.99, 2.0])
+def test_a_camera_straight_down_or_level_is_answered(pitch):
+    logs = logarithms(floor("checks", 42.0).astype(np.float32))
+    nothing = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    found = find_lattice(logs, hole(), nothing, camera(pitch))
+    assert found is None or np.isfinite(found.photo_from_plane).all()
+    # Nothing is known beside the hole.
+    near = cv2.dilate(hole().astype(np.uint8), np.ones((121, 121), np.uint8)) > 0
+    assert find_lattice(logs, hole(), near & ~hole(), camera(pitch)) is None

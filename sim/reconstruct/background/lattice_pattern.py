@@ -110,7 +110,7 @@ class Lattice:
             weight = np.where(seen, np.exp(-0.5 * (i * i + j * j) / NEAR**2), 0.0)
             # Ground farther away is seen less sharply.
             weight *= np.clip(1.0 / np.maximum(np.abs(inverse_depth * depth), 1e-6), 0.0, 1.0) ** SHARPER
-            weight = np.asarray(weight, dtype=np.float32)
+            weight = np.nan_to_num(weight).astype(np.float32)
             total += weight[:, None] * cv2.remap(pattern, x, y, cv2.INTER_LINEAR)[0].reshape(len(places), -1)
             weights += weight
         return np.asarray(total / np.maximum(weights, 1e-9)[:, None], dtype=np.float32), weights
@@ -152,6 +152,8 @@ class _Copy:
     def share(self, lattice: Lattice, places: NDArray[np.int64]) -> float:
         """Return the share of the variance at ``places`` (n, 2) that ``lattice``, of this copy, foretells: at most 1, 0
         where it foretells less than half of them."""
+        if not len(places):
+            return 0.0
         truth = self.pattern[places[:, 1], places[:, 0]]
         found, weights = lattice.foretold(self.pattern, self.known, places.astype(np.float64) + 0.5)
         told = weights > ENOUGH
@@ -243,7 +245,9 @@ class _Ground:
         pitch, roll = (cv2.Rodrigues(np.asarray(axis) * turn)[0] for axis, turn in zip(AXES, turns, strict=True))
         normal = pitch @ roll @ self.normal
         right = np.cross(normal, [0.0, 0.0, 1.0])
-        right /= max(float(np.linalg.norm(right)), 1e-9)
+        length = float(np.linalg.norm(right))
+        # Seen straight from above, any direction of the plane will do.
+        right = right / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
         return np.asarray(self.lens @ np.stack([right, np.cross(normal, right), -normal], axis=1))
 
     def around(self, hole: Mask) -> Mask:
