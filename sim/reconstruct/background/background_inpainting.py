@@ -285,33 +285,31 @@ def _fill_part(
     dark: shadow outside of the hole, which is no source.
     """
     covered = _widened(objects & open_hole, max(1, round(BESIDE * max(part.shape) / 1024))) | barred
-    edges = edges_behind(logarithms(filling), part, covered, open_hole | dark)
+    logs, lattice = logarithms(filling), None
+    edges = edges_behind(logs, part, covered, open_hole | dark)
     barred = barred | dark
-    logs, rest, lattice = logarithms(filling), barred | (open_hole & ~part), None
+    rest = barred | (open_hole & ~part)
     if part.sum() > REPEATED * part.size:
         lattice = find_lattice(logs, part, rest, camera)
     if lattice is not None:
         # Joints are straight edges, too.
-        edges = [edge for edge in edges if not goes_on(lattice, logs, part, rest, camera, ~edge.below(part.shape))]
+        above = [~edge.below(part.shape) for edge in edges]
+        same = goes_on(lattice, logs, part, rest, camera, above)
+        edges = [edge for edge, joint in zip(edges, same, strict=True) if not joint]
     for side, ground in _sides(edges, part.shape):
         target, others = part & side, rest | ~side
         if ground and lattice is None and edges and target.sum() > REPEATED * target.size:
             lattice = find_lattice(logs, target, others, camera)
-        if ground and lattice is not None and not _is_best(filling, target, others, camera, options, lattice):
-            lattice = None
-        if ground and lattice is None:
+        choice = None
+        if ground and lattice is not None and target.any():
+            task = InpaintingTask(filling, target, others, camera, options, lattice)
+            choice = choose_method(task, (*PHOTO_WAYS, *GROUND_WAYS, AS_LATTICE))
+        if ground and (choice is None or choice.way != AS_LATTICE):
             # A pattern that repeats is known better than what is left of it in shadow.
             filling[...], target = relit(filling, target, others, objects, changed)
-        _fill_surface(filling, target, others, objects, ground, camera, options, notice, lattice)
+            lattice = choice = None
+        _fill_surface(filling, target, others, objects, ground, camera, options, notice, lattice, choice)
     _soften(filling, part, edges)
-
-
-def _is_best(
-    filling: Picture, target: Mask, closed: Mask, camera: Camera, options: FillOptions, lattice: Lattice
-) -> bool:
-    """Whether ``target`` (H, W) is filled best as a ``lattice``, by trial."""
-    task = InpaintingTask(filling, target, closed, camera, options, lattice)
-    return choose_method(task, (*PHOTO_WAYS, *GROUND_WAYS, AS_LATTICE)).way == AS_LATTICE
 
 
 def _fill_surface(
@@ -324,20 +322,21 @@ def _fill_surface(
     options: FillOptions,
     notice: Notice,
     lattice: Lattice | None,
+    choice: MethodChoice | None,
 ) -> None:
-    """Inpaint ``target`` of one surface in ``filling``, in place, piece by piece, each at the level of its border."""
+    """Inpaint ``target`` of one surface in ``filling``, in place, piece by piece, each at the level of its border.
+
+    choice: of the method, where it has been made; ``lattice`` is for that one alone.
+    """
     pieces = _pieces(target)
     if not pieces:
         return
-    # Surfaces beyond the ground's far border never use the top view.
-    ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
     largest = pieces[-1]
-    task = InpaintingTask(filling, largest, closed | (target & ~largest), camera, options, lattice)
-    if ground and lattice is not None:
-        ways = (*ways, AS_LATTICE)
-    choice = MethodChoice(PHOTO_WAYS[0], {}, np.inf)
-    if largest.sum() > SMALL * largest.size:
-        choice = choose_method(task, ways)
+    if choice is None and largest.sum() > SMALL * largest.size:
+        # Surfaces beyond the ground's far border never use the top view.
+        ways = PHOTO_WAYS + GROUND_WAYS if ground else PHOTO_WAYS
+        choice = choose_method(InpaintingTask(filling, largest, closed | (target & ~largest), camera, options), ways)
+    choice = choice or MethodChoice(PHOTO_WAYS[0], {}, np.inf)
     reliable = choice.certain >= GUESSED or choice.scores.get(choice.way, 0.0) >= GOOD
     if not reliable and largest.sum() > NOTICED * largest.size:
         rows, columns = box(largest, 0)

@@ -8,6 +8,7 @@ that is found with it: whatever else of the camera is wrong stretches the lattic
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -19,6 +20,7 @@ from scipy import fft, ndimage, optimize
 from ...scene.model import Camera
 from ..segmentation.mask_geometry import grown
 from .surface_inpainting import light_field
+from .top_view import lens_matrix
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -170,6 +172,12 @@ def find_lattice(picture: Picture, target: Mask, closed: Mask, camera: Camera) -
     camera: above the ground z = 0; only where its horizon is counts, and that is refined.
     """
     copy = _Copy(picture, target, closed, camera)
+    found = _lattice_in(copy)
+    return None if found is None else found.scaled(1.0 / copy.across, 1.0 / copy.down)
+
+
+def _lattice_in(copy: _Copy) -> Lattice | None:
+    """The lattice on ``copy``; None where it has none."""
     if copy.known.sum() < SAMPLES:
         return None
     places = np.asarray(np.argwhere(copy.region)[::37, ::-1] + 0.5, dtype=np.float64)
@@ -181,31 +189,34 @@ def find_lattice(picture: Picture, target: Mask, closed: Mask, camera: Camera) -
     if found is None:
         return None
     refined = _refined(found, copy)
-    return refined.scaled(1.0 / copy.across, 1.0 / copy.down) if refined.share >= FORETOLD else None
+    return refined if refined.share >= FORETOLD else None
 
 
-def goes_on(lattice: Lattice, picture: Picture, target: Mask, closed: Mask, camera: Camera, beyond: Mask) -> bool:
-    """Return whether the pattern goes on in ``beyond`` (H, W) beside ``target`` (H, W), which is then the same surface.
-    The others: as for ``find_lattice``."""
+def goes_on(
+    lattice: Lattice, picture: Picture, target: Mask, closed: Mask, camera: Camera, beyond: Sequence[Mask]
+) -> list[bool]:
+    """Return of each part ``beyond`` (H, W) whether the pattern goes on in it beside ``target`` (H, W), so that it is
+    the same surface. The others: as for ``find_lattice``."""
+    if not beyond:
+        return []
     copy = _Copy(picture, target, closed, camera)
-    places = copy.beside(beyond)
-    return len(places) >= FEWEST and copy.share(lattice.scaled(copy.across, copy.down), places) >= FORETOLD
+    small, parts = lattice.scaled(copy.across, copy.down), [copy.beside(part) for part in beyond]
+    return [len(places) >= FEWEST and copy.share(small, places) >= FORETOLD for places in parts]
 
 
 def repeated(picture: Picture, target: Mask, closed: Mask, camera: Camera, things: Mask) -> Mask:
     """Return those of the connected ``things`` (H, W) that are marks of a pattern which repeats around ``target``.
     The others: as for ``find_lattice``."""
     result = np.zeros_like(things)
-    lattice = find_lattice(picture, target, closed, camera)
+    copy = _Copy(picture, target, closed, camera)
+    lattice = _lattice_in(copy)
     if lattice is None:
         return result
-    copy = _Copy(picture, target, closed, camera)
-    small = lattice.scaled(copy.across, copy.down)
     count, labels = cv2.connectedComponents(things.astype(np.uint8), connectivity=8)
     for index in range(1, count):
         # With what is around it: by itself it may be of one colour.
         places = copy.within(grown(labels == index, max(2, round(0.005 * max(things.shape)))))
-        if len(places) and copy.share(small, places) >= FORETOLD:
+        if len(places) and copy.share(lattice, places) >= FORETOLD:
             result |= labels == index
     return result
 
@@ -236,9 +247,7 @@ class _Ground:
     def __init__(self, camera: Camera, across: float, down: float) -> None:
         rotation = np.asarray(camera.world_from_camera, dtype=np.float64)[:3, :3]
         self.normal = rotation.T @ np.array([0.0, 0.0, 1.0])
-        self.lens = np.diag([across, down, 1.0]) @ np.array(
-            [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-        )
+        self.lens = np.diag([across, down, 1.0]) @ lens_matrix(camera)
 
     def photo_from_plane(self, turns: Values) -> Values:
         """Return the (3, 3) homography with the normal turned by ``turns`` (2,), pitch and roll in radians."""

@@ -93,8 +93,12 @@ def ground_frame(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float6
         ],
         axis=1,
     )
-    lens = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    return lens @ columns, ahead
+    return lens_matrix(camera) @ columns, ahead
+
+
+def lens_matrix(camera: Camera) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix from directions in the frame of ``camera`` to its pixels."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
 
 def ground_positions(camera: Camera, shape: tuple[int, int]) -> NDArray[np.float64]:
