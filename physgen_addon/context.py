@@ -274,3 +274,9 @@ def _fit_again(uid: int, width: int) -> None:
         if window.scene.session_uid == uid and all(area.width != width for area in views):
             with bpy.context.temp_override(window=window):
                 show_photo(bpy.context, window.scene)
+
+
+def remove_entry(entries: bpy.types.bpy_prop_collection, index: int) -> int:
+    """Remove entry ``index`` of a list and return the index of the one that is active then."""
+    entries.remove(index)
+    return max(min(index, len(entries) - 1), 0)

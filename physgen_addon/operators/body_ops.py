@@ -7,7 +7,7 @@ from mathutils import Matrix, Vector
 from ...sim.errors import InputError
 from ...sim.scene.material import delete_preset, save_preset
 from ..compat import OperatorMixin
-from ..context import active, selected
+from ..context import active, remove_entry, selected
 from ..props import material_props
 from ..props.body_props import bodies, is_body
 from ..props.material_props import CUSTOM, get_material, set_material
@@ -277,8 +277,7 @@ class PHYSGEN_OT_remove_push(OfBody, bpy.types.Operator):
         if not 0 <= body.push_index < len(body.pushes):
             self.report({"WARNING"}, "There is no push to remove")
             return {"CANCELLED"}
-        body.pushes.remove(body.push_index)
-        body.push_index = max(min(body.push_index, len(body.pushes) - 1), 0)
+        body.push_index = remove_entry(body.pushes, body.push_index)
         return {"FINISHED"}
 
 
@@ -322,8 +321,7 @@ class PHYSGEN_OT_remove_pin(OfBody, bpy.types.Operator):
             self.report({"WARNING"}, "There is no pin to remove")
             return {"CANCELLED"}
         box = body.pins[body.pin_index].box
-        body.pins.remove(body.pin_index)
-        body.pin_index = max(min(body.pin_index, len(body.pins) - 1), 0)
+        body.pin_index = remove_entry(body.pins, body.pin_index)
         in_use = any(pin.box == box for item in bpy.data.objects for pin in item.physgen.pins)
         if box is not None and PIN_MARK in box and not in_use:
             bpy.data.objects.remove(box)

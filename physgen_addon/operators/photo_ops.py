@@ -8,7 +8,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...sim.errors import InputError
-from ..context import TAB, active, show_beside
+from ..context import TAB, active, remove_entry, show_beside
 from ..interpreter import photo_check
 from ..photo.photo_image import (
     SUFFIXES,
@@ -132,8 +132,7 @@ class PHYSGEN_OT_remove_box(bpy.types.Operator):
         """Remove it; the next one becomes active."""
         state = context.scene.physgen_photo
         drop_mask(state.boxes[state.box_index])
-        state.boxes.remove(state.box_index)
-        state.box_index = max(0, min(state.box_index, len(state.boxes) - 1))
+        state.box_index = remove_entry(state.boxes, state.box_index)
         return {"FINISHED"}
 
 

@@ -7,7 +7,7 @@ import bpy
 
 from ...sim.effects.registry import Parameter, effect
 from ..compat import OperatorMixin
-from ..context import selected
+from ..context import remove_entry, selected
 from ..props.body_props import bodies, is_body
 from ..props.scene_props import EFFECT_ITEMS
 from ..scene_io.export_meshes import rest_bounds
@@ -72,8 +72,7 @@ class PHYSGEN_OT_remove_stack_effect(_OfStack, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove it; its neighbour becomes active."""
         world = context.scene.physgen.world
-        world.effects.remove(world.effect_index)
-        world.effect_index = max(min(world.effect_index, len(world.effects) - 1), 0)
+        world.effect_index = remove_entry(world.effects, world.effect_index)
         return {"FINISHED"}
 
 

@@ -25,6 +25,7 @@ from .sidebar import (
     Sidebar,
     active_body,
     draw_arrows,
+    edited_list,
     is_in,
     optional,
     settings,
@@ -152,11 +153,8 @@ class PHYSGEN_PT_pushes(DynamicPart, bpy.types.Panel):
             text.sentences(locked, context, "A push gives it a velocity at a later frame: it hops again.")
             locked.operator(PHYSGEN_OT_add_push.bl_idname, icon="ADD")
             return
-        row = locked.row()
-        row.template_list("PHYSGEN_UL_pushes", "", body, "pushes", body, "push_index", rows=2)
-        side = row.column(align=True)
-        side.operator(PHYSGEN_OT_add_push.bl_idname, text="", icon="ADD")
-        side.operator(PHYSGEN_OT_remove_push.bl_idname, text="", icon="REMOVE")
+        add, remove = PHYSGEN_OT_add_push.bl_idname, PHYSGEN_OT_remove_push.bl_idname
+        edited_list(locked, "PHYSGEN_UL_pushes", body, "pushes", "push_index", add, remove)
         if body.push_index < len(body.pushes):
             push = body.pushes[body.push_index]
             locked.prop(push, "frame")
@@ -176,11 +174,8 @@ class PHYSGEN_PT_pins(DynamicPart, bpy.types.Panel):
         layout, body = self.layout, active_body(context).physgen
         locked = settings(layout, context)
         if body.pins:
-            row = locked.row()
-            row.template_list("PHYSGEN_UL_pins", "", body, "pins", body, "pin_index", rows=2)
-            side = row.column(align=True)
-            side.operator(PHYSGEN_OT_add_pin.bl_idname, text="", icon="ADD")
-            side.operator(PHYSGEN_OT_remove_pin.bl_idname, text="", icon="REMOVE")
+            add, remove = PHYSGEN_OT_add_pin.bl_idname, PHYSGEN_OT_remove_pin.bl_idname
+            edited_list(locked, "PHYSGEN_UL_pins", body, "pins", "pin_index", add, remove)
             if any(pin.box is None or not is_in(pin.box, context.scene) for pin in body.pins):
                 text.sentences(
                     locked, context, "A pin has lost its box: choose another empty or remove it.", icon="ERROR"

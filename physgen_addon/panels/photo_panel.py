@@ -33,7 +33,7 @@ from ..photo.photo_consent import OFFLINE, is_allowed
 from ..photo.photo_image import tool_help
 from ..photo.photo_request import made_folder, scene_folder
 from ..props.preferences import python
-from .sidebar import draw_job, optional
+from .sidebar import draw_job, edited_list, optional
 
 KEY_VARIABLE = "PHYSGEN_API_KEY"
 
@@ -240,11 +240,8 @@ def draw_photo(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def _draw_boxes(layout: bpy.types.UILayout, context: bpy.types.Context, state: bpy.types.PropertyGroup) -> None:
     if state.boxes:
-        row = layout.row()
-        row.template_list("PHYSGEN_UL_boxes", "", state, "boxes", state, "box_index", rows=3)
-        buttons = row.column(align=True)
-        buttons.operator(PHYSGEN_OT_draw_box.bl_idname, text="", icon="ADD")
-        buttons.operator(PHYSGEN_OT_remove_box.bl_idname, text="", icon="REMOVE")
+        draw, remove = PHYSGEN_OT_draw_box.bl_idname, PHYSGEN_OT_remove_box.bl_idname
+        edited_list(layout, "PHYSGEN_UL_boxes", state, "boxes", "box_index", draw, remove, rows=3)
     else:
         text.sentences(layout, context, "Draw a box around each object that is to move, or let them be found.")
     if tool_help():

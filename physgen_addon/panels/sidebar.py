@@ -59,6 +59,20 @@ def settings(layout: bpy.types.UILayout, context: bpy.types.Context, *, why: boo
     return column
 
 
+def edited_list(
+    layout: bpy.types.UILayout, kind: str, data: Any, entries: str, index: str, add: str, remove: str, *, rows: int = 2
+) -> None:
+    """Draw the collection ``entries`` of ``data``, whose active one is ``index``, with buttons to add and remove one.
+
+    kind: the class of list. add, remove: operators.
+    """
+    row = layout.row()
+    row.template_list(kind, "", data, entries, data, index, rows=rows)
+    side = row.column(align=True)
+    side.operator(add, text="", icon="ADD")
+    side.operator(remove, text="", icon="REMOVE")
+
+
 def optional(
     layout: bpy.types.UILayout, data: Any, switched_by: str, value: str, heading: str, *, otherwise: str = ""
 ) -> None:

@@ -18,7 +18,7 @@ from skimage.segmentation import felzenszwalb
 from ..reconstruct_options import Proposal
 from .mask_geometry import Mask, grown
 from .proposal_features import copy_of, lab_of
-from .round_things import larger_thing_seen
+from .round_things import larger_thing_seen, score_of_room
 
 Pixels = NDArray[np.uint8]
 
@@ -51,10 +51,6 @@ colours over that of the blocks. Floors of six patterns had 1.8 to 7, since squa
 too small, cut or hidden; stacked blocks, dominoes and stripes of balls 0 to 0.5."""
 MARGIN = 0.06
 """Margin of a box around a block, over its longer side."""
-ROOM = 0.5
-"""Gap to the next block over its shorter side, above which more of it says no more."""
-SCORES = (0.9, 0.99)
-"""Scores of what touches another, and of what stands with that much room."""
 ABOVE, OVER, LOADED = 0.4, 0.1, 0.79
 """Gap to a block above over its own height up to which, and share of the narrower one's width above the other from
 which that may rest on it; score of what carries another, which would be left in the air."""
@@ -208,5 +204,4 @@ def _score(item: Block, found: Sequence[Block]) -> float:
         over = (min(right, x1) - max(left, x0)) / min(right - left, x1 - x0)
         if over > OVER and abs(top - y1) < ABOVE * (bottom - top):
             return LOADED
-    room = float(np.clip(gap / (ROOM * item.width), 0.0, 1.0))
-    return round(SCORES[0] + room * (SCORES[1] - SCORES[0]), 3)
+    return score_of_room(gap, item.width)

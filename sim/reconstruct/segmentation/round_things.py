@@ -42,7 +42,7 @@ COVER = 0.08
 MARGIN = 0.08
 """Margin of a box around a circle, over its diameter; the rim's inner edge may be the clearer one."""
 ROOM = 0.5
-"""Gap to the next thing over the radius, above which more of it says no more."""
+"""Gap to the next thing over the radius or width, above which more of it says no more."""
 SCORES = (0.9, 0.99)
 """Scores of what touches another, and of what stands with that much room."""
 CUT_SCORE = 0.79
@@ -145,7 +145,12 @@ def _score(item: Circle, found: Sequence[Circle], width: int, height: int) -> fl
     if to_border < 0.0 or any(gap < -LAPPED * min(item.radius, radius) for gap, radius in gaps):
         return CUT_SCORE
     gap = min([to_border, *(gap for gap, _ in gaps)])
-    room = float(np.clip(gap / (ROOM * item.radius), 0.0, 1.0))
+    return score_of_room(gap, item.radius)
+
+
+def score_of_room(gap: float, size: float) -> float:
+    """Return the score of one of many things by its ``gap`` to the next over its ``size``, of the same unit."""
+    room = float(np.clip(gap / (ROOM * size), 0.0, 1.0))
     return round(SCORES[0] + room * (SCORES[1] - SCORES[0]), 3)
 
 
