@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FORMAT = "physgen-proposals/1"
 LIST_FILE, PICTURE_FILE = "proposals.json", "proposals.jpg"
-REVISION = 18
+REVISION = 19
 """Raised with every change that changes which objects are proposed."""
 SEARCHED = 1024
 """Longest side in pixels of the photo as it is read; the search itself needs less."""

@@ -2,8 +2,8 @@
 """Segmentation: masks of objects, their occlusion order, and amodal completion.
 
 object_proposals.py    objects without a box: proposal_features.py features of a candidate, round_things.py and
-                       alike_blocks.py many of a kind, whole_objects.py which are whole, outline_sharpness.py what is
-                       in focus
+                       alike_blocks.py many of a kind, whole_objects.py which are whole,
+                       joined_pieces.py which are pieces of one, outline_sharpness.py what is in focus
 object_masks.py        masks from the user, an adapter, or boxes
 box_segmentation.py    the object in a loose box: box_crop.py its surroundings, mask_proposals.py proposals by
                        colour_models.py, plain_backdrop.py before a plain backdrop, mirrored_outline.py alike left and

@@ -21,6 +21,8 @@ FINE = 560
 SMOOTHER, LEAST_TEXTURE, LEAST_SEEN = 0.7, 0.03, 10
 """Texture of a part over nearly the smoothest of the ground, below which it is no ground, and pixels from which that is
 known; texture over lightness from which ground is rough enough to tell. A shoe's lining on asphalt has 0.55."""
+PADDING = 0.35
+"""Margin of background to learn from, over the box' longer side."""
 EDGE = 3.0
 """Gradient of an edge, in CIELAB units per pixel."""
 
@@ -73,6 +75,15 @@ def crop_around_box(
         empty if keep is None else keep,
         empty if drop is None else drop,
     )
+
+
+def padded(box: Box, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], Box]:
+    """Return the rows and columns of ``box`` and its surroundings in a picture of ``shape``, and ``box`` in them."""
+    x0, y0, x1, y1 = box
+    pad = round(PADDING * max(x1 - x0, y1 - y0)) + 2
+    left, top = max(0, x0 - pad), max(0, y0 - pad)
+    window = slice(top, min(shape[0], y1 + pad)), slice(left, min(shape[1], x1 + pad))
+    return window, (x0 - left, y0 - top, x1 - left, y1 - top)
 
 
 def texture_of(lightness: NDArray[np.float32]) -> NDArray[np.float32]:

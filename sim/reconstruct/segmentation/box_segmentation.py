@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .box_crop import FINE, Box, BoxCrop, crop_around_box, edge_strength, small_copy
+from .box_crop import FINE, PADDING, Box, BoxCrop, crop_around_box, edge_strength, small_copy
 from .contour_evidence import Completed, completed_by_contours
 from .gaps_and_rods import gaps_and_rods
 from .ground_shade import shaded_ground, without_ground
@@ -36,8 +36,6 @@ COARSE_SIZE = 280
 """Longest side in pixels of the copy on which proposals are made."""
 FINE_PIXELS = 1_200_000
 """Crops above this size skip the second pass; the first pass' outline is then only smoothed."""
-PADDING = 0.35
-"""Margin of background to learn from, over the box' longer side."""
 FAINT = 0.4
 """Gradient across an outline, in CIELAB units per pixel, below which there is none."""
 SAME = 0.9

@@ -23,8 +23,9 @@ from ..camera.vanishing_points import straight_lines
 from ..reconstruct_options import Proposal
 from .alike_blocks import alike_blocks
 from .border_ownership import lines_go_on, sides_go_on
-from .box_crop import crop_around_box, edge_strength
+from .box_crop import crop_around_box, edge_strength, padded
 from .colour_models import ground_likelihood
+from .joined_pieces import in_one_piece
 from .mask_geometry import Mask, extent_of, largest_component, largest_part, solidity_of
 from .mask_proposals import ground_like
 from .mask_proposals import proposals as mask_proposals
@@ -112,6 +113,7 @@ def propose_boxes(pixels: Pixels, *, most: int = MOST) -> list[Proposal]:
     if sum(value > LEFT_ASIDE for value in listed) > 1:
         sharp = sharp_as(int(np.argmax(listed)), masks, pixels)
         listed = [value if clear else min(value, LEFT_ASIDE) for value, clear in zip(listed, sharp, strict=True)]
+    masks, listed = in_one_piece(small, masks, listed, LEFT_ASIDE)
     for mask, value in sorted(zip(masks, listed, strict=True), key=lambda pair: -pair[1])[:most]:
         x0, y0, x1, y1 = _loose(extent_of(mask), size)
         box = (round(x0 * across), round(y0 * down), round(x1 * across), round(y1 * down))
@@ -371,22 +373,21 @@ def _segmented(pixels: Pixels, box: Box, start: Mask) -> tuple[Mask | None, floa
     where there is none."""
     height, width = pixels.shape[:2]
     x0, y0, x1, y1 = (round(v) for v in box)
-    pad = round(0.35 * max(x1 - x0, y1 - y0)) + 2
-    left, top, right, bottom = max(0, x0 - pad), max(0, y0 - pad), min(width, x1 + pad), min(height, y1 + pad)
-    crop = np.ascontiguousarray(pixels[top:bottom, left:right])
+    window, inner = padded((x0, y0, x1, y1), (height, width))
+    crop = np.ascontiguousarray(pixels[window])
     nothing = np.zeros(crop.shape[:2], dtype=bool)
-    view = crop_around_box(crop, (x0 - left, y0 - top, x1 - left, y1 - top), nothing)
+    view = crop_around_box(crop, inner, nothing)
     if view.outside.sum() < 60 or view.inside.sum() < 60:
         return None, 0.0, 1.0
     guesses = [largest_part(mask, nothing) for mask in mask_proposals(view, 3)]
-    guesses.append(largest_component(start[top:bottom, left:right] & view.inside))
+    guesses.append(largest_component(start[window] & view.inside))
     ground = ground_like(view)
     values = [objectness(view, mask, ground) for mask in guesses]
     best = int(np.argmax(values))
     if guesses[best].sum() < 20:
         return None, 0.0, 1.0
     result = np.zeros((height, width), dtype=bool)
-    result[top:bottom, left:right] = guesses[best]
+    result[window] = guesses[best]
     return result, float(values[best]), float(ground[guesses[best]].mean())
 
 

@@ -132,7 +132,7 @@ def _is_group(whole: Candidate, inner: Sequence[Candidate], lab: NDArray[np.floa
     chosen: list[Candidate] = []
     good = [part for part in inner if part.score >= GOOD and not part.shade]
     good = [part for part in good if LEAST_PART * area <= float(part.mask.sum()) <= MOST_PART * area]
-    standing = [part for part in good if _stands_alone(part.mask, whole.mask)]
+    standing = [part for part in good if stands_alone(part.mask, whole.mask)]
     for part in sorted(good, key=lambda item: -int(item.mask.sum())):
         if extent_of(part.mask)[3] < top + (bottom - top) / 3:
             continue
@@ -145,11 +145,11 @@ def _is_group(whole: Candidate, inner: Sequence[Candidate], lab: NDArray[np.floa
     if len(chosen) < 2 or solidity_of(whole.mask) >= max(solidity_of(part.mask) for part in chosen) - DENTED:
         return False
     share = float((covered & whole.mask).sum()) / area
-    return share > ALL or (share > 0.5 * ALL and _rest_is_ground(covered & whole.mask, whole.mask, lab))
+    return share > ALL or (share > 0.5 * ALL and rest_is_ground(covered & whole.mask, whole.mask, lab))
 
 
-def _stands_alone(part: Mask, whole: Mask) -> bool:
-    """Whether what lies below two fifths of ``part``'s width is not the rest of ``whole``."""
+def stands_alone(part: Mask, whole: Mask) -> bool:
+    """Return whether what lies below two fifths of ``part``'s width is not the rest of ``whole``."""
     x0, y0, x1, y1 = extent_of(part)
     columns = np.flatnonzero(part.any(axis=0))
     lowest = part.shape[0] - 1 - part[::-1, columns].argmax(axis=0)
@@ -174,21 +174,21 @@ def _has_ground(whole: Candidate, item: Candidate, inner: Sequence[Candidate], l
         if apart and other.score >= GOOD and not other.shade and float(other.mask.sum()) > 0.12 * area:
             return False
     dented = solidity_of(whole.mask) < solidity_of(item.mask) - 0.01
-    if dented and _rest_is_ground(item.mask, whole.mask, lab):
+    if dented and rest_is_ground(item.mask, whole.mask, lab):
         return True
-    return _stands_alone(item.mask, whole.mask) and _goes_on(item.mask, whole.mask, lab)
+    return stands_alone(item.mask, whole.mask) and _goes_on(item.mask, whole.mask, lab)
 
 
 def _goes_on(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> bool:
     """Whether ``part`` ends at its outline, but ``whole`` without it, such as a tree behind, goes on beyond its own."""
-    own, rest = _steps(part, part, lab), _steps(whole & ~part, whole, lab)
+    own, rest = outline_steps(part, part, lab), outline_steps(whole & ~part, whole, lab)
     if not len(own) or not len(rest) or (own > STEP).mean() < OUTLINED or (rest > STEP).mean() > OPEN:
         return False
     return float(np.median(rest)) < FAINTER * float(np.median(own))
 
 
-def _steps(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Steps of colour (n,) across the outline of ``whole`` where that is the outline of ``part``; not at the border."""
+def outline_steps(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the steps of colour (n,) across the outline of ``whole`` where that is of ``part``; in the photo."""
     kernel = np.ones((3, 3), np.uint8)
     inner = cv2.erode(whole.astype(np.uint8), kernel) > 0
     means, seen = [], part & ~inner
@@ -209,13 +209,13 @@ def _is_cut(whole: Candidate, inner: Sequence[Candidate], lab: NDArray[np.float3
         share = float(item.mask.sum()) / area
         if item.score < max(BETTER, whole.score) or item.shade or not AMID <= share <= MOST_PART:
             continue
-        if cut_share(item.mask) <= CUT and (_steps(item.mask, item.mask, lab) > STEP).mean() >= OUTLINED:
+        if cut_share(item.mask) <= CUT and (outline_steps(item.mask, item.mask, lab) > STEP).mean() >= OUTLINED:
             return True
     return False
 
 
-def _rest_is_ground(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> bool:
-    """Whether ``whole`` without ``part`` looks like what is beside it, in light or shade, and not like ``part``."""
+def rest_is_ground(part: Mask, whole: Mask, lab: NDArray[np.float32]) -> bool:
+    """Return whether ``whole`` without ``part`` looks like what is beside it, lit or shaded, and not like ``part``."""
     kernel = np.ones((3, 3), np.uint8)
     rest = whole & ~(cv2.dilate(part.astype(np.uint8), kernel) > 0)
     rest = cv2.morphologyEx(rest.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
