@@ -34,7 +34,7 @@ from ..trust import trusted_spec
 from ..validation import read_json, to_json
 from .reconstruct_record import Request, read_stamp, require_stamp, stamp_to_json
 
-RECONSTRUCT_REVISION = 85
+RECONSTRUCT_REVISION = 86
 """Raised with every change of reconstruction that changes what a photo becomes."""
 
 

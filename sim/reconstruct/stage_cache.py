@@ -59,7 +59,7 @@ Arrays = Mapping[str, NDArray[Any]]
 Notice = Callable[[str], None]
 
 STAGES_FOLDER = "stages"
-REVISION = 71
+REVISION = 72
 """Increase with every change that alters a stage's results."""
 MAX_BYTES = 2**30
 """Limit of one stage's arrays; a larger file is not a cache file."""

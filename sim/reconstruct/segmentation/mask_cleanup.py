@@ -30,6 +30,10 @@ BOX_CORNERS, CORNER_CUT, BOX_OVERLAP = 6, 0.015, 0.96
 BESIDE = 8.0
 """Median distance in CIELAB, row by row, from the background beside above which a hole shows something else: 0.4 to 6
 was measured in a strap, a handle, between slats, legs and limbs, 10 to 16 for a dial, a stripe and a shaded side."""
+MARKS, MARK, MARK_SIZE = 5, 2.5, 0.008
+"""Marks from which a region is a printed face and no hole: numerals on a dial, dots and letters; distance of their
+colours from any of the background's, over ``likeness``; and their least extent over the object's size. What shows
+through a hole is the background, which has no marks of its own there."""
 PRINT_SHARE = 0.25
 """Largest share of a box that is a print: the opening of a frame is larger."""
 
@@ -113,8 +117,8 @@ def see_through(
     """Return the connected parts of ``regions`` through which the background shows.
 
     Most of their pixels (``share``, 0 to 1) look like the ground beside the object at about the same height, within
-    ``likeness`` (CIELAB delta E), they are as rough as it, and wider than a letter printed on a cover. slots: also
-    narrow and long ones, of half of that likeness.
+    ``likeness`` (CIELAB delta E), they are as rough as it, without marks, and wider than a letter printed on a cover.
+    slots: also narrow and long ones, of half of that likeness.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(regions.astype(np.uint8), connectivity=4)
     result = np.zeros_like(mask)
@@ -143,9 +147,24 @@ def see_through(
         if (distances < like).mean() > share and apart < 1.5 * like and _as_beside(lab, region, ring):
             beside = np.zeros_like(mask)
             beside[rows] = ring[rows]
-            if not is_smoother(lab[..., 0], region, beside):
+            if not is_smoother(lab[..., 0], region, beside) and not _has_marks(lab, region, near, like, size):
                 result |= region
     return result
+
+
+def _has_marks(lab: NDArray[np.float32], region: Mask, near: NDArray[np.float32], like: float, size: float) -> bool:
+    """Whether ``MARKS`` or more marks lie in ``region`` (H, W), unlike the background's colours ``near`` (n, 3).
+
+    size: the object's, in pixels. What touches the region's outline is the object's, not a mark.
+    """
+    inside = shrunk(region | enclosed_holes(region), 2)
+    unlike = np.zeros_like(region)
+    unlike[inside] = cKDTree(near).query(lab[inside], distance_upper_bound=MARK * like)[0] > MARK * like
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(unlike.astype(np.uint8), connectivity=8)
+    outer = np.unique(labels[inside & ~shrunk(inside)])
+    large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= max(3.0, MARK_SIZE * size)
+    large[0] = large[outer] = False
+    return int(large.sum()) >= MARKS
 
 
 def _as_beside(lab: NDArray[np.float32], region: Mask, ring: Mask) -> bool:
