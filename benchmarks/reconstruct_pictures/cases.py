@@ -129,10 +129,14 @@ def draw(set_name: str, number: int) -> Case:
     count, first = SETS[set_name]
     if not 0 <= number < count:
         raise ValueError(f"picture {number}: the set {set_name} has 0 to {count - 1}")
-    seed = first + number
+    return draw_seed(first + number, f"case_{number:02}")
+
+
+def draw_seed(seed: int, name: str) -> Case:
+    """The picture of a seed, called ``name``. Raises ValueError where no arrangement is found."""
     rng = np.random.default_rng(seed)
     # What is to be there for certain goes by the number, the rest by chance.
-    k = number + first
+    k = seed
     relation = "seat" if k % 32 == 7 else "behind" if k % 5 in (1, 3) or k % 16 == 7 else "apart"
     ground = GROUNDS[k % len(GROUNDS)]
     light = LIGHTS[(k // 2) % len(LIGHTS)]
@@ -148,7 +152,7 @@ def draw(set_name: str, number: int) -> Case:
         if camera is not None and _as_wanted(camera, placed, relation):
             break
     else:
-        raise ValueError(f"{set_name} {number}: no arrangement found")
+        raise ValueError(f"{name}, seed {seed}: no arrangement found")
     reach = max(float(np.abs(item.vertices).max()) for item in placed)
     ground_paint = paint_of_ground(ground, rng)
     items = tuple(_painted(item, ground_paint, hard if i == 0 else None, rng) for i, item in enumerate(placed))
@@ -157,7 +161,7 @@ def draw(set_name: str, number: int) -> Case:
     lamps, sky = lights(light, walled, reach, rng)
     back = max(float(item.vertices[:, 1].max()) for item in items)
     return Case(
-        name=f"case_{number:02}",
+        name=name,
         seed=seed,
         camera=camera,
         items=items,

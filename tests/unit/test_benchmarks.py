@@ -24,6 +24,7 @@ FAST = (
     "playback",
     "render",
     "rest",
+    "shadows",
     "shapes",
     "splats",
     "stiff",

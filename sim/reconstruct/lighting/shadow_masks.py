@@ -9,7 +9,7 @@ one ground under one light. By default a shadow is where both agree: proxy bodie
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,10 +19,9 @@ from scipy import ndimage
 from ...scene.model import Camera
 from ...srgb import bytes_to_linear
 from ..segmentation.mask_geometry import enclosed_holes
-from .ground_pixels import GroundPixels, ProxyBody, ground_pixels, proxy_body
-from .shadow_lamps import ShadowLamp, ShadowLight, direction_of, fit_light, fit_wall_light, light_shares
-from .shadow_model import SHADOW_RATIO, darkening_sums, light_level_posterior, shadow_probability
-from .shadow_planes import ShadowPlane, ground_plane, wall_behind
+from .ground_pixels import GroundPixels
+from .shadow_levels import FEWEST, PlaneLevels, plane_levels, standing_bodies
+from .shadow_model import SHADOW_RATIO, darkening_sums, shadow_probability
 
 Mask = NDArray[np.bool_]
 
@@ -150,8 +149,6 @@ def object_holes(
 
 Values = NDArray[np.float64]
 
-FEWEST = 50
-"""Fewest ground pixels for an estimate."""
 FAR = 0.25
 """Weight of a distance of one object side against the log of the blocked light, where shadows meet."""
 
@@ -166,8 +163,6 @@ DARKENED = 0.3
 in 15 photos and rendered pictures had 0.8 to 2; leaves below a log −0.2."""
 GAP = 0.02
 """Distance over the largest object's size at which a shadow touches an object."""
-GRAZING = 0.05
-"""Cosine on a wall of a lamp that hardly shines on it: what is foreseen there is an error of the wall's direction."""
 CONTACT_SKY = 0.4
 """Share of the sky that an object hides around its contact, where the ground is darker under any light."""
 
@@ -197,37 +192,17 @@ def cast_shadows(
     that blocks most. An object without a pixel, or above the horizon, has no shadow.
     """
     found = [CastShadow(*np.zeros((3, *pixels.shape[:2]), dtype=bool)) for _ in masks]
-    standing = [(index, body) for index, mask in enumerate(masks) if (body := proxy_body(mask, camera)) is not None]
-    if not standing:
+    bodies = standing_bodies(masks, camera)
+    planes = list(plane_levels(pixels, masks, bodies, camera, stay)) if bodies else []
+    if not planes:
         return found
-    bodies = [body for _, body in standing]
-    outlines = [masks[index] for index, _ in standing]
-    closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
-    wall = wall_behind(pixels, masks, camera, stay)
-    lamps: tuple[ShadowLamp, ...] = ()
-    cast: list[tuple[Mask, list[_Shade]]] = []
-    for plane in (ground_plane(closed.shape, wall), wall):
-        if plane is None:
-            continue
-        turned = [replace(body, points=plane.in_frame(body.points)) for body in bodies]
-        ground = ground_pixels(pixels, masks, camera, turned, stay, plane)
-        if ground is None or len(ground.rows) < FEWEST:
-            continue
-        upright = plane is wall
-        if upright:
-            light = fit_wall_light(ground, turned, _turned(lamps, plane) if lamps else None)
-        else:
-            light = fit_light(ground, turned)
-            lamps = light.lamps
-        elsewhere = closed | ~plane.region
-        cast.append((elsewhere, _shades(ground, turned, light, outlines, elsewhere, upright=upright)))
-    if not cast:
-        return found
+    outlines = [masks[index] for index in bodies]
+    cast = [(plane.elsewhere, _shades(plane)) for plane in planes]
     # A shadow on a wall goes on from the one on the ground.
-    whole = [_Shade.joined([shades[position] for _, shades in cast]) for position in range(len(standing))]
+    whole = [_Shade.joined([shades[position] for _, shades in cast]) for position in range(len(bodies))]
     gap = max(1, round(GAP * max(int(np.ptp(at)) + 1 for mask in outlines for at in np.nonzero(mask))))
     dark = [_connected(shade.dark, mask, gap, shade.foreseen) for shade, mask in zip(whole, outlines, strict=True)]
-    for position, (index, _) in enumerate(standing):
+    for position, index in enumerate(bodies):
         # A hard shadow goes on, but not into that of another object.
         others = [other & ~dark[position] for place, other in enumerate(dark) if place != position]
         parts = [
@@ -270,46 +245,23 @@ class _Shade:
         return cls(dark, dim, foreseen, expected, contact, (both, told), parts[0].missing)
 
 
-def _turned(lamps: Sequence[ShadowLamp], plane: ShadowPlane) -> list[ShadowLamp]:
-    """``lamps`` over the ground in the frame of ``plane``, as far as they shine on its front."""
-    toward = [plane.axes @ direction_of(lamp.slide) for lamp in lamps]
-    return [
-        replace(lamp, slide=axis[:2] / axis[2]) for lamp, axis in zip(lamps, toward, strict=True) if axis[2] > GRAZING
-    ]
-
-
-def _shades(
-    ground: GroundPixels,
-    bodies: Sequence[ProxyBody],
-    light: ShadowLight,
-    outlines: Sequence[Mask],
-    elsewhere: Mask,
-    *,
-    upright: bool,
-) -> list[_Shade]:
-    """What each of ``bodies`` with ``outlines`` (H, W) takes from the light on ``ground``, a wall if ``upright``.
-
-    elsewhere: (H, W) pixels that do not show that plane.
-    """
-    total, alone, hidden = light_shares(ground, bodies, light)
-    distances = np.stack([_distance(ground, mask) for mask in outlines])
-    owned = _owned(ground, alone, distances)
-    parts = _parts(ground, alone, total, owned)
-    # Around its contact an object darkens the ground under any light, but not a wall.
-    around = np.zeros_like(total) if upright else np.minimum(hidden.sum(axis=0), 1.0)
-    posterior = light_level_posterior(ground, total, around, distances.min(axis=0))
+def _shades(plane: PlaneLevels) -> list[_Shade]:
+    """What each object takes from the light of ``plane``."""
+    ground, shape = plane.ground, plane.elsewhere.shape
+    owned = _owned(ground, plane.alone, plane.distances)
+    parts = _parts(ground, plane.alone, plane.kept, owned)
 
     def shown(values: Values, above: float) -> Mask:
-        return np.asarray((_full_size(ground, values, elsewhere.shape) > above) & ~elsewhere)
+        return np.asarray((_full_size(ground, values, shape) > above) & ~plane.elsewhere)
 
-    probable = [shadow_probability(ground, posterior, *each) for each in zip(parts, owned, strict=True)]
+    probable = [shadow_probability(ground, plane.levels, *each) for each in zip(parts, owned, strict=True)]
     past_all = np.prod([left for _, _, left in probable], axis=0)
     shades = []
-    for (inner, outer, left), kept, near in zip(probable, alone, hidden, strict=True):
-        cast = kept < FORESEEN
-        foreseen = cast & (light.share > 0.0)
-        reach = cv2.resize(ground.picture(cast.astype(np.float32)), elsewhere.shape[::-1]) > 0.5
-        contact = np.zeros_like(cast) if upright else near > CONTACT_SKY
+    for (inner, outer, left), alone, hidden in zip(probable, plane.alone, plane.hidden, strict=True):
+        cast = alone < FORESEEN
+        foreseen = cast & (plane.light.share > 0.0)
+        reach = cv2.resize(ground.picture(cast.astype(np.float32)), shape[::-1]) > 0.5
+        contact = np.zeros_like(cast) if plane.upright else hidden > CONTACT_SKY
         shades.append(
             _Shade(
                 dark=shown(1.0 - left, 1.0 - SHADOW_RATIO),
@@ -322,13 +274,6 @@ def _shades(
             )
         )
     return shades
-
-
-def _distance(ground: GroundPixels, mask: Mask) -> Values:
-    """Distance (N,) from the object in ``mask`` (H, W), over the objects' size."""
-    small = cv2.resize(mask.astype(np.uint8), ground.known.shape[::-1], interpolation=cv2.INTER_AREA)
-    pixels = cv2.distanceTransform((small == 0).astype(np.uint8), cv2.DIST_L2, 5)[ground.rows, ground.columns]
-    return np.asarray(pixels / ground.object_side)
 
 
 def _owned(ground: GroundPixels, alone: Values, distances: Values) -> Mask:
