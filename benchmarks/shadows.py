@@ -24,6 +24,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from physgen.benchmarks.common import benchmark_parser
+from physgen.benchmarks.cutouts import sheet
+from physgen.benchmarks.reconstruct_pictures.scoring import iou
 from physgen.benchmarks.shadow_pictures.drawn_picture import DrawnPicture, draw_picture
 from physgen.sim.reconstruct.lighting.shadow_masks import cast_shadows
 from physgen.sim.reconstruct.lighting.shadow_model import SHADOW_RATIO
@@ -33,15 +35,16 @@ Mask = NDArray[np.bool_]
 
 LEAST_SHADOW = 60
 """Fewest pixels of true shadow."""
-SHEET_WIDTH, ACROSS = 320, 3
-"""Pixels of a picture on the sheet, and pictures in a row."""
+TALL, ACROSS = 200, 3
+"""Height of a picture on the sheet in pixels, and pictures in a row."""
 
 
 def judged(number: int) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
     """Return the row of picture ``number`` and its panel for the sheet; None if it has no shadow to speak of."""
     try:
         picture = draw_picture(number)
-    except ValueError:
+    except ValueError as error:
+        sys.stderr.write(f"{error}\n")
         return None
     covered = np.logical_or.reduce(picture.masks)
     true = (picture.kept < SHADOW_RATIO) & ~covered
@@ -52,7 +55,7 @@ def judged(number: int) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
     row = {
         "number": number,
         "light": picture.light,
-        "iou": float((found & true).sum() / (found | true).sum()),
+        "iou": iou(found, true),
         "area": float(found.sum() / true.sum()),
     }
     return row, _panel(picture, found, true)
@@ -64,8 +67,8 @@ def _panel(picture: DrawnPicture, found: Mask, true: Mask) -> NDArray[np.uint8]:
     for region, colour in ((found & true, (0, 160, 0)), (found & ~true, (220, 0, 0)), (true & ~found, (0, 60, 255))):
         panel[region] = (0.4 * panel[region] + 0.6 * np.array(colour)).astype(np.uint8)
     both = np.concatenate([picture.pixels, panel], axis=1)
-    height = round(2 * SHEET_WIDTH * both.shape[0] / both.shape[1])
-    return np.asarray(cv2.resize(both, (2 * SHEET_WIDTH, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    width = round(TALL * both.shape[1] / both.shape[0])
+    return np.asarray(cv2.resize(both, (width, TALL), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -85,13 +88,6 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     }
 
 
-def _sheet(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    height = max(panel.shape[0] for panel in panels)
-    padded = [np.pad(panel, ((0, height - panel.shape[0]), (0, 0), (0, 0))) for panel in panels]
-    padded += [np.zeros_like(padded[0])] * (-len(padded) % ACROSS)
-    return np.concatenate([np.concatenate(padded[at : at + ACROSS], 1) for at in range(0, len(padded), ACROSS)])
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns 0."""
     parser = benchmark_parser("shadows", __doc__, count=2)
@@ -107,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows.append(answer[0])
             panels.append(answer[1])
     if options.sheet and panels:
-        Image.fromarray(_sheet(panels)).save(options.sheet)
+        Image.fromarray(sheet([[panel] for panel in panels], ACROSS)).save(options.sheet)
     found = summary(rows)
     if options.json:
         print(json.dumps({"pictures": rows, "summary": found}))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -57,7 +58,15 @@ class Item:
     @property
     def vertices(self) -> NDArray[np.float64]:
         """(V, 3) world metres."""
-        return self.body.mesh.vertices @ self.world_from_mesh[:3, :3].T + self.world_from_mesh[:3, 3]
+        return self._in_world(self.body.mesh.vertices)
+
+    @property
+    def parts(self) -> list[NDArray[np.float64]]:
+        """Corners (V, 3), world metres, of the convex parts that it is made of."""
+        return [self._in_world(part.vertices) for part, _ in self.body.parts]
+
+    def _in_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(points @ self.world_from_mesh[:3, :3].T + self.world_from_mesh[:3, 3])
 
 
 @dataclass(frozen=True)
@@ -116,9 +125,13 @@ class Case:
 
 def silhouette(camera: Camera, item: Item) -> NDArray[np.bool_]:
     """(H, W) about what a body covers, each part without its hollows; ``shoot`` renders it exactly."""
+    return hulls(camera, item.parts)
+
+
+def hulls(camera: Camera, parts: Iterable[NDArray[np.float64]]) -> NDArray[np.bool_]:
+    """(H, W) what the convex hulls of ``parts`` (V, 3), world metres, cover."""
     canvas = np.zeros((camera.height, camera.width), np.uint8)
-    for part, _ in item.body.parts:
-        points = part.vertices @ item.world_from_mesh[:3, :3].T + item.world_from_mesh[:3, 3]
+    for points in parts:
         outline = cv2.convexHull(np.rint(camera.project(points)[:, :2]).astype(np.int32))
         cv2.fillConvexPoly(canvas, outline, 1)
     return canvas > 0
@@ -135,18 +148,17 @@ def draw(set_name: str, number: int) -> Case:
 def draw_seed(seed: int, name: str) -> Case:
     """The picture of a seed, called ``name``. Raises ValueError where no arrangement is found."""
     rng = np.random.default_rng(seed)
-    # What is to be there for certain goes by the number, the rest by chance.
-    k = seed
-    relation = "seat" if k % 32 == 7 else "behind" if k % 5 in (1, 3) or k % 16 == 7 else "apart"
-    ground = GROUNDS[k % len(GROUNDS)]
-    light = LIGHTS[(k // 2) % len(LIGHTS)]
-    hard = {0: "alike", 3: "dark", 5: "alike"}.get(k % 9)
+    # What is to be there for certain goes by the seed itself, the rest by chance.
+    relation = "seat" if seed % 32 == 7 else "behind" if seed % 5 in (1, 3) or seed % 16 == 7 else "apart"
+    ground = GROUNDS[seed % len(GROUNDS)]
+    light = LIGHTS[(seed // 2) % len(LIGHTS)]
+    hard = {0: "alike", 3: "dark", 5: "alike"}.get(seed % 9)
     wide = (640, 480)
-    width, height = wide[::-1] if k % 6 == 4 else wide
-    fov = math.radians(35.0 + 40.0 * ((k * 0.618) % 1.0))
-    roll = math.radians(rng.uniform(1.5, 6.0) * rng.choice([-1, 1])) if k % 5 == 2 else 0.0
+    width, height = wide[::-1] if seed % 6 == 4 else wide
+    fov = math.radians(35.0 + 40.0 * ((seed * 0.618) % 1.0))
+    roll = math.radians(rng.uniform(1.5, 6.0) * rng.choice([-1, 1])) if seed % 5 == 2 else 0.0
     for _ in range(MOST_ARRANGEMENTS):
-        placed = _arrange(relation, k, rng)
+        placed = _arrange(relation, seed, rng)
         pitch = math.radians(rng.uniform(24.0, 55.0) if _flat(placed) else rng.uniform(9.0, 48.0))
         camera = aim(placed, (width, height), fov, pitch, roll, rng)
         if camera is not None and _as_wanted(camera, placed, relation):
@@ -176,7 +188,7 @@ def draw_seed(seed: int, name: str) -> Case:
         lamps=lamps,
         sky=sky,
         sky_gradient=float(rng.uniform(0.2, 0.8)),
-        exif=k % 3 == 2,
+        exif=seed % 3 == 2,
         noise=float(rng.uniform(0.8, 2.0)),
         reach=reach,
     )

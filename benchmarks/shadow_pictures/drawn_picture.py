@@ -77,11 +77,7 @@ def _scaled(camera: Camera, scale: float) -> Camera:
 def _surfaces(case: Case, camera: Camera, rng: np.random.Generator) -> tuple[Picture, Picture, Mask, float]:
     """Linear light (H, W, 3) of ground and wall, the share (H, W) of it past the things, where neither is, and the
     things' size in metres."""
-    parts = [
-        part.vertices @ item.world_from_mesh[:3, :3].T + item.world_from_mesh[:3, 3]
-        for item in case.items
-        for part, _ in item.body.parts
-    ]
+    parts = [part for item in case.items for part in item.parts]
     points = np.concatenate(parts)
     top, low, high = points[:, 2].max(), points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     size = max(float((high - low).max()), float(top))
@@ -199,12 +195,8 @@ def _mirrored(light: Picture, case: Case, camera: Camera, rng: np.random.Generat
     """``light`` with faint mirror images of the things, as on a polished ground."""
     strength = rng.uniform(0.03, 0.25)
     for item in case.items:
-        image = np.zeros(light.shape[:2], np.uint8)
-        for part, _ in item.body.parts:
-            points = part.vertices @ item.world_from_mesh[:3, :3].T + item.world_from_mesh[:3, 3]
-            seen = camera.project(points * (1, 1, -1))
-            if (seen[:, 2] > 0).all():
-                cv2.fillConvexPoly(image, cv2.convexHull(np.rint(seen[:, :2]).astype(np.int32)), 1)
+        below = [part * (1, 1, -1) for part in item.parts]
+        image = cases.hulls(camera, [part for part in below if (camera.project(part)[:, 2] > 0).all()])
         share = cv2.GaussianBlur(image.astype(np.float32), (0, 0), rng.uniform(0.6, 4))[..., None]
         light = light * (1 - strength * share) + strength * share * item.paint[0] * rng.uniform(0.3, 1.2)
     return light

@@ -15,6 +15,7 @@ from physgen.benchmarks.reconstruct_pictures.cases import Case, Lamp
 
 Values = NDArray[np.float64]
 Picture = NDArray[np.float32]
+Shade = NDArray[np.uint8]
 
 RASTER = 640
 """Cells along a plane's longer side."""
@@ -52,7 +53,7 @@ class Plane:
         """Return world ``points`` (..., 3) in the plane's frame."""
         return np.asarray((points - self.origin) @ self.axes.T)
 
-    def shadow(self, parts: Sequence[Values], *, toward: Values | None = None, lamp: Values | None = None) -> Any:
+    def shadow(self, parts: Sequence[Values], *, toward: Values | None = None, lamp: Values | None = None) -> Shade:
         """Return the raster (rows, columns), 1 where the convex hulls of ``parts`` (M, 3) block the light from the unit
         vector ``toward`` (3,), or from a ``lamp`` at (3,)."""
         canvas = np.zeros(self.shape, np.uint8)
@@ -129,9 +130,15 @@ def light_on(
 
 def _cosine_weighted(count: int, rng: np.random.Generator) -> Values:
     """Unit vectors (count, 3) about z, in sunflower order from a random turn."""
-    number = np.arange(count) + 0.5
-    radius, turn = np.sqrt(number / count), number * math.pi * (3.0 - math.sqrt(5.0)) + rng.uniform(0, 6.28)
+    radius, turn = _sunflower(count)
+    turn = turn + rng.uniform(0, 6.28)
     return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1.0 - radius**2)])
+
+
+def _sunflower(count: int) -> tuple[Values, Values]:
+    """Radii and angles (count,) of points evenly over a disc of radius 1."""
+    number = np.arange(count) + 0.5
+    return np.sqrt(number / count), number * math.pi * (3.0 - math.sqrt(5.0))
 
 
 def _points_of(lamp: Lamp, direction: Values) -> Iterator[dict[str, Values]]:
@@ -139,13 +146,13 @@ def _points_of(lamp: Lamp, direction: Values) -> Iterator[dict[str, Values]]:
     side = np.cross(direction, [0.0, 0.0, 1.0])
     side /= max(float(np.linalg.norm(side)), 1e-9)
     other = np.cross(side, direction)
-    number = np.arange(LAMP) + 0.5
     if lamp.distance is None:
-        radius, turn = np.sqrt(number / LAMP) * lamp.width / 2.0, number * math.pi * (3.0 - math.sqrt(5.0))
+        radius, turn = _sunflower(LAMP)
+        radius = radius * lamp.width / 2.0
         for x, y in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
             ray = direction + side * x + other * y
             yield {"toward": ray / np.linalg.norm(ray)}
         return
-    size = lamp.distance * lamp.width
+    size, number = lamp.distance * lamp.width, np.arange(LAMP) + 0.5
     for x, y in zip(number / LAMP - 0.5, (number * 0.618034) % 1.0 - 0.5, strict=True):
         yield {"lamp": direction * lamp.distance + side * (x * size) + other * (y * size * 1.3)}

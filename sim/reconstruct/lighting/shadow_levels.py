@@ -66,8 +66,10 @@ def plane_levels(
     """Yield the ground, then a wall behind the objects, where enough of them is seen.
 
     pixels: (H, W, 3) sRGB. masks: (H, W) of all objects. bodies: of ``standing_bodies``; the others cast no shadow.
-    camera: above the ground z = 0. stay: (H, W) things that are no objects, or None.
+    camera: above the ground z = 0. stay: (H, W) things that are no objects, or None. Nothing without a body.
     """
+    if not bodies:
+        return
     closed = np.logical_or.reduce(masks if stay is None else [*masks, stay])
     outlines = [masks[index] for index in bodies]
     wall = wall_behind(pixels, masks, camera, stay)

@@ -193,7 +193,7 @@ def cast_shadows(
     """
     found = [CastShadow(*np.zeros((3, *pixels.shape[:2]), dtype=bool)) for _ in masks]
     bodies = standing_bodies(masks, camera)
-    planes = list(plane_levels(pixels, masks, bodies, camera, stay)) if bodies else []
+    planes = list(plane_levels(pixels, masks, bodies, camera, stay))
     if not planes:
         return found
     outlines = [masks[index] for index in bodies]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -77,10 +78,13 @@ def crop_around_box(
     )
 
 
-def padded(box: Box, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], Box]:
-    """Return the rows and columns of ``box`` and its surroundings in a picture of ``shape``, and ``box`` in them."""
+def padded(box: Box, shape: tuple[int, ...], whole: Callable[[float], int] = round) -> tuple[tuple[slice, slice], Box]:
+    """Return the rows and columns of ``box`` and its surroundings in a picture of ``shape``, and ``box`` in them.
+
+    whole: makes whole pixels of the margin.
+    """
     x0, y0, x1, y1 = box
-    pad = round(PADDING * max(x1 - x0, y1 - y0)) + 2
+    pad = whole(PADDING * max(x1 - x0, y1 - y0)) + 2
     left, top = max(0, x0 - pad), max(0, y0 - pad)
     window = slice(top, min(shape[0], y1 + pad)), slice(left, min(shape[1], x1 + pad))
     return window, (x0 - left, y0 - top, x1 - left, y1 - top)

@@ -9,6 +9,7 @@ cannot leak. Doubtful masks give notices.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from .box_crop import FINE, PADDING, Box, BoxCrop, crop_around_box, edge_strength, small_copy
+from .box_crop import FINE, Box, BoxCrop, crop_around_box, edge_strength, padded, small_copy
 from .contour_evidence import Completed, completed_by_contours
 from .gaps_and_rods import gaps_and_rods
 from .ground_shade import shaded_ground, without_ground
@@ -163,16 +164,13 @@ def _surroundings(
     x0, y0, x1, y1 = box
     if (x1 - x0) * (y1 - y0) > 0.98 * width * height:
         raise InputError(f"{where}: the box covers the whole photo; leave background around the object")
-    margin = int(np.ceil(PADDING * max(x1 - x0, y1 - y0))) + 2
-    left, top = max(0, x0 - margin), max(0, y0 - margin)
-    window = slice(top, min(height, y1 + margin)), slice(left, min(width, x1 + margin))
+    window, inner = padded(box, (height, width), math.ceil)
     crop = np.ascontiguousarray(pixels[window])
     taken = np.zeros(crop.shape[:2], dtype=bool) if others is None else others[window]
-    inner = (x0 - left, y0 - top, x1 - left, y1 - top)
     if taken[inner[1] : inner[3], inner[0] : inner[2]].all():
         raise InputError(f"{where}: other objects fill its whole box; draw the boxes around the visible part of each")
     keep, drop = (np.ascontiguousarray(part[window]) for part in (strokes.keep, strokes.drop))
-    return _Surroundings(crop, inner, left, top, taken, keep & ~taken, drop)
+    return _Surroundings(crop, inner, window[1].start, window[0].start, taken, keep & ~taken, drop)
 
 
 def _outlined(pixels: NDArray[np.uint8], box: Box, near: _Surroundings, coarse: Mask) -> tuple[Mask, Mask | None]:

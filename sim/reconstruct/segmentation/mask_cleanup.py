@@ -142,24 +142,25 @@ def see_through(
         inside = lab[region]
         # Some hundred samples of each are enough.
         near, inside = near[:: max(1, len(near) // 600)], inside[:: max(1, len(inside) // 600)]
-        distances = cKDTree(near).query(inside)[0]
+        colours = cKDTree(near)
+        distances = colours.query(inside)[0]
         apart = float(np.linalg.norm(np.median(near, axis=0) - np.median(inside, axis=0)))
         if (distances < like).mean() > share and apart < 1.5 * like and _as_beside(lab, region, ring):
             beside = np.zeros_like(mask)
             beside[rows] = ring[rows]
-            if not is_smoother(lab[..., 0], region, beside) and not _has_marks(lab, region, near, like, size):
+            if not is_smoother(lab[..., 0], region, beside) and not _has_marks(lab, region, colours, like, size):
                 result |= region
     return result
 
 
-def _has_marks(lab: NDArray[np.float32], region: Mask, near: NDArray[np.float32], like: float, size: float) -> bool:
-    """Whether ``MARKS`` or more marks lie in ``region`` (H, W), unlike the background's colours ``near`` (n, 3).
+def _has_marks(lab: NDArray[np.float32], region: Mask, colours: cKDTree, like: float, size: float) -> bool:
+    """Whether ``MARKS`` or more marks lie in ``region`` (H, W), unlike the background's ``colours``.
 
     size: the object's, in pixels. What touches the region's outline is the object's, not a mark.
     """
     inside = shrunk(region | enclosed_holes(region), 2)
     unlike = np.zeros_like(region)
-    unlike[inside] = cKDTree(near).query(lab[inside], distance_upper_bound=MARK * like)[0] > MARK * like
+    unlike[inside] = colours.query(lab[inside], distance_upper_bound=MARK * like)[0] > MARK * like
     _, labels, stats, _ = cv2.connectedComponentsWithStats(unlike.astype(np.uint8), connectivity=8)
     outer = np.unique(labels[inside & ~shrunk(inside)])
     large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= max(3.0, MARK_SIZE * size)
