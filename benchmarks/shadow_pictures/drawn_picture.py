@@ -47,7 +47,10 @@ class DrawnPicture:
 
 
 def draw_picture(number: int) -> DrawnPicture:
-    """Return picture ``number``, from 0. Raises ValueError where no arrangement is found."""
+    """Return picture ``number``, from 0. Raises ValueError for a negative one, and where no arrangement is found."""
+    if number < 0:
+        # Below, the seeds of the benchmark's own sets would come.
+        raise ValueError(f"picture {number}: numbers begin at 0")
     case = cases.draw_seed(FIRST_SEED + number, f"drawn {number}")
     rng = np.random.default_rng(10**7 + number)
     camera = _scaled(case.camera, rng.uniform(0.4, 0.6))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from physgen.benchmarks.reconstruct_pictures import cases
-from physgen.benchmarks.shadow_pictures.drawn_picture import draw_picture
+from physgen.benchmarks.shadow_pictures.drawn_picture import FIRST_SEED, draw_picture
 from physgen.benchmarks.shadow_pictures.plane_patterns import KINDS, albedo
 from physgen.benchmarks.shadow_pictures.plane_shadows import Plane, light_on
 
@@ -53,3 +53,9 @@ def test_a_picture_repeats_and_its_shadows_lie_off_the_sky():
     assert first.kept.shape == first.pixels.shape[:2] and first.kept.min() >= 0.0 and first.kept.max() < 1.02
     assert first.light in cases.LIGHTS and all(mask.any() for mask in first.masks)
     assert (draw_picture(4).pixels.shape != first.pixels.shape) or (draw_picture(4).pixels != first.pixels).any()
+
+
+def test_no_picture_has_a_seed_of_the_rendered_sets():
+    with pytest.raises(ValueError, match="begin at 0"):
+        draw_picture(-1)
+    assert all(first + count <= FIRST_SEED for count, first in cases.SETS.values())
