@@ -187,10 +187,11 @@ def _apart(moves: Sequence[Move], slow: float) -> float:
 
 
 def _without_repeat(moves: tuple[Move, ...]) -> tuple[Move, ...]:
-    """Return ``moves`` without the last hop on the spot of a thing that has moved before, unless it ends them; empty
-    where there is none. What comes later does not rely on it."""
+    """Return ``moves`` without the last of a thing that has moved before, unless it ends them; empty where there is
+    none. What comes later must not rely on it: it was a hop on the spot, or all that comes later are."""
     for at in range(len(moves) - 2, 0, -1):
-        if moves[at].on_the_spot and any(move.name == moves[at].name for move in moves[:at]):
+        again = any(move.name == moves[at].name for move in moves[:at])
+        if again and (moves[at].on_the_spot or all(move.on_the_spot for move in moves[at + 1 :])):
             return (*moves[:at], *moves[at + 1 :])
     return ()
 

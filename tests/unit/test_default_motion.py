@@ -567,16 +567,17 @@ def test_what_bounces_for_long_at_the_end_gets_time_instead_of_a_hop_that_repeat
     assert [move.name for move in short.moves] == [move.name for move in moves]
     assert [move.name for move in long.moves] == [first.name, other.name]
     assert long.frames / long.fps / long.slow - long.moves[-1].landed_s > 0.5
-    # What comes last stays, and so does what goes somewhere.
-    assert (
-        len(
-            fitted(
-                scene, (first, other, dataclasses.replace(other, start_s=0.0)), dict.fromkeys(SLOW, 1.6), fps=24.0
-            ).moves
-        )
-        == 3
-    )
-    assert len(fitted(scene, (first, first, other), dict.fromkeys(SLOW, 1.6), fps=24.0).moves) == 3
+    long_settles = dict.fromkeys(SLOW, 1.6)
+    # What comes last stays.
+    assert len(fitted(scene, (first, other, other), long_settles, fps=24.0).moves) == 3
+    # Where what comes later goes somewhere too, a thing that does not leave the way there free stays as well.
+    assert any(first.aside) and other.on_the_spot
+    aside = dataclasses.replace(other, aside=(0.01, 0.0, 0.0))
+    assert [move.name for move in fitted(scene, (first, first, other), long_settles, fps=24.0).moves] == [
+        first.name,
+        other.name,
+    ]
+    assert len(fitted(scene, (first, first, aside), long_settles, fps=24.0).moves) == 3
 
 
 def test_what_rolls_out_of_the_picture_at_any_speed_stays_if_something_else_moves(table, tmp_path):
